@@ -237,6 +237,7 @@ class Fitted(Point):
     columns: list[Array]
     runs: int = 0
     weight: tuple[float, ...] = ()  # by channel, where some count for more when the twin is to simulate alone
+    base: Fitted | None = None  # that this one was begun from, by another twin part
 
     @cached_property
     def grams(self) -> Grams:

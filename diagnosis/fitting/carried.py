@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from data.arrays import Array
 from data.batch import Batch
 from diagnosis.contracts import Point
+from twin.calibration.least_squares import z_bounds
 from twin.calibration.problem import CalibrationProblem, Nuisances
 from twin.compile import compile_network
 from twin.network import Network
@@ -65,10 +66,16 @@ def carried_nuisances(old: CalibrationProblem, new: CalibrationProblem, nuisance
     return out
 
 
-def carried_z(old: CalibrationProblem, new: CalibrationProblem, z: Array) -> Array:
-    """z (p,) of the new problem: parameters that both problems fit at their old values, others at their prior means."""
+def carried_z(old: CalibrationProblem, new: CalibrationProblem, z: Array, other: Array | None = None) -> Array:
+    """z (p,) of the new problem: parameters that both problems fit at their old values, others at `other` (p,) or their
+    prior means."""
     by_name = {u.name: u.prior + u.spread * v for u, v in zip(old.unknowns, z, strict=True)}
-    return np.array([(by_name.get(u.name, u.prior) - u.prior) / u.spread for u in new.unknowns])
+    begin = np.zeros(len(new.unknowns)) if other is None else other
+    values = [
+        (by_name[u.name] - u.prior) / u.spread if u.name in by_name else v
+        for u, v in zip(new.unknowns, begin, strict=True)
+    ]
+    return np.clip(values, *z_bounds(new.unknowns))
 
 
 def _names(problem: CalibrationProblem) -> list[str]:

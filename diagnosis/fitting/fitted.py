@@ -17,7 +17,7 @@ from data.errors import InputError, WorkError
 from data.machine import Machine
 from diagnosis.contracts import Fitted, Point, own_step
 from diagnosis.fitting.batches import coarse
-from diagnosis.fitting.carried import carried_start
+from diagnosis.fitting.carried import carried_nuisances, carried_start, carried_z
 from diagnosis.fitting.covariance import (
     Covariance,
     Structure,
@@ -127,7 +127,7 @@ def on_all_rows(fitted: Fitted, batches: Sequence[Batch]) -> Fitted:
     one = plain(fitted)
     problem = CalibrationProblem.of(one.problem.network, batches, spacing_s(batches))
     at = Point(one.machine, one.part, tuple(batches), problem, one.z, one.nuisance)
-    return replace(calibrated(at, one.noise, one.runs), weight=fitted.weight)
+    return replace(calibrated(at, one.noise, one.runs), weight=fitted.weight, base=fitted)
 
 
 def relearned(fitted: Fitted) -> Fitted:
@@ -139,7 +139,7 @@ def relearned(fitted: Fitted) -> Fitted:
     factor = np.ones(len(fitted.rows)) if before.factor is None else before.factor
     starts = fitted, under(plain(fitted), before)
     done = [_learned(start, structure, fitted.runs, (before.share,), factor) for start in starts]
-    return replace(max(done, key=lambda f: f.log_evidence), weight=fitted.weight)
+    return replace(max(done, key=lambda f: f.log_evidence), weight=fitted.weight, base=fitted.base)
 
 
 def _learned(at: Point, structure: Structure, runs: int, shares: Sequence[float], factor: Array) -> Fitted:
@@ -279,7 +279,8 @@ def refitted(
         return out
 
     z = np.clip(z, *z_bounds(problem.unknowns))
-    return _descended(replace(now, part=part, problem=problem, z=z, nuisance=nuisance), model, steps)
+    begun = replace(now, part=part, problem=problem, z=z, nuisance=nuisance, base=now)
+    return _descended(begun, model, steps)
 
 
 def _descended(fitted: Fitted, model: Callable[[Array], list[Array]], steps: int) -> Fitted:
@@ -349,18 +350,29 @@ def plain(fitted: Fitted) -> Fitted:
     count as one (`twin.calibration`), and some channels for more (`Fitted.weight`). What a machine file states is
     simulated without structure.
 
-    Structure can hold a fit where no twin simulates well alone: where a misfit passes for noise, the priors' means are
-    a second start, and the likelier optimum is taken.
+    Structure can hold a fit where no twin simulates well alone: where a misfit passes for noise, the likelier optimum
+    is taken, from here and from where the twin that it was begun from simulates alone, or else the priors' means.
     """
     problem, tolerance = fitted.problem, POLICY.fit_tolerance_nats
     state = State.at(problem, fitted.z, fitted.own, fitted.noise)
     state = annealed(problem, state, POLICY.plain_steps, tolerance)
     if misfits(noise_left(problem, state)):
-        options = FitOptions(max_iterations=POLICY.plain_steps, tolerance=tolerance, reweight=True)
-        with suppress(WorkError):  # no machine is as the priors' means say
-            state = likelier(problem, state, settled(problem, options)[0])
+        with suppress(WorkError, InputError):  # no machine has such values
+            state = likelier(problem, state, _elsewhere(fitted))
     one = calibrated(_moved(fitted, state), state.noise, fitted.runs)
     return _weighted(one, np.array(fitted.weight)) if fitted.weight else one
+
+
+def _elsewhere(fitted: Fitted) -> State:
+    """An optimum without structure, reached without a look at where the fit is."""
+    problem, base, tolerance = fitted.problem, fitted.base, POLICY.fit_tolerance_nats
+    if base is None:
+        options = FitOptions(max_iterations=POLICY.plain_steps, tolerance=tolerance, reweight=True)
+        return settled(problem, options)[0]
+    one = plain(base)
+    z = carried_z(one.problem, problem, one.z, fitted.z)
+    state = State.at(problem, z, carried_nuisances(one.problem, problem, one.nuisance), one.noise)
+    return annealed(problem, state, POLICY.plain_steps, tolerance)
 
 
 def _weighted(one: Fitted, weight: Array) -> Fitted:
