@@ -220,11 +220,12 @@ def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Se
             "explained: a network this coarse may leave as much"
         )
     text += f" ({', '.join(left)})" if left else ""
-    seen = []
-    for limit, place in zip(limits[:_MAX_NAMED], places or [n.where.name for n in limits], strict=False):
-        if limit.limit is not None:
-            what = _noun(limit.mechanism, Where(limit.where.kind, limit.where.name), place)
-            seen.append(f"{what} {with_unit(few(limit.limit), limit.unit)}")
+    least: dict[str, str] = {}  # of a mechanism with a dimension; the limits come by mechanism, the least first
+    for n, place in zip(limits, places or [n.where.name for n in limits], strict=True):
+        if n.limit is not None and n.unit not in ("", "1") and n.mechanism not in least:
+            what = _noun(n.mechanism, Where(n.where.kind, n.where.name), place)
+            least[n.mechanism] = f"{what} {with_unit(few(n.limit), n.unit)}"
+    seen = list(least.values())[:_MAX_NAMED]
     more = f" and {len(limits) - _MAX_NAMED} more in the table of limits" if len(limits) > _MAX_NAMED else ""
     return (
         f"{text}. An effect above these limits would have been seen: {', '.join(seen)}{more}." if seen else f"{text}."

@@ -195,13 +195,13 @@ def test_errors_that_fall_are_told_the_greatest_fall_first_and_those_that_rise_b
 
 def test_verdicts() -> None:
     limits = [DetectionLimit(mechanism=m, where=Place(kind="node", name="bed"), limit=v, unit=u)
-              for m, v, u in (("floor_sink", 1.82, "W/K"), ("cabinet_heat", 12.3, "W"), ("sun", 20.0, "W/m**2"),
-                              ("belt_loss", 5.0, "W"))]  # fmt: skip
+              for m, v, u in (("bearing_load", 0.001, "1"), ("floor_sink", 1.82, "W/K"), ("floor_sink", 2.5, "W/K"),
+                              ("cabinet_heat", 12.3, "W"), ("sun", 20.0, "W/m**2"), ("belt_loss", 5.0, "W"))]  # fmt: skip
     after = (Rms("z", "um", 1.3, 1.3, 1.2),)
-    assert verdict_statement("consistent", rms=after, limits=limits, places=["the bed"] * 4) == (
+    assert verdict_statement("consistent", rms=after, limits=limits, places=["the bed"] * 6) == (
         "Nothing is missing: the remaining error is the noise (z 1.3 µm (noise 1.2)). An effect above these limits "
         "would have been seen: heat to the floor at the bed 1.8 W/K, waste heat of a control cabinet or of auxiliaries "
-        "at the bed 12 W, sunlight on one face at the bed 20 W/m² and 1 more in the table of limits."
+        "at the bed 12 W, sunlight on one face at the bed 20 W/m² and 3 more in the table of limits."
     )
     assert verdict_statement("consistent") == "Nothing is missing: the remaining error is the noise."
     more = "Too weak for a claim: heat to the floor: bed. A night switched off would show more."
