@@ -196,7 +196,8 @@ def test_errors_that_fall_are_told_the_greatest_fall_first_and_those_that_rise_b
 def test_verdicts() -> None:
     limits = [DetectionLimit(mechanism=m, where=Place(kind="node", name="bed"), limit=v, unit=u)
               for m, v, u in (("bearing_load", 0.001, "1"), ("floor_sink", 1.82, "W/K"), ("floor_sink", 2.5, "W/K"),
-                              ("cabinet_heat", 12.3, "W"), ("sun", 20.0, "W/m**2"), ("belt_loss", 5.0, "W"))]  # fmt: skip
+                              ("cabinet_heat", 12.3, "W"), ("sun", 20.0, "W/m**2"),
+                              ("belt_loss", 5.0, "W"))]  # fmt: skip
     after = (Rms("z", "um", 1.3, 1.3, 1.2),)
     assert verdict_statement("consistent", rms=after, limits=limits, places=["the bed"] * 6) == (
         "Nothing is missing: the remaining error is the noise (z 1.3 µm (noise 1.2)). An effect above these limits "
