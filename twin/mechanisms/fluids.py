@@ -59,8 +59,10 @@ class JacketChiller(Mechanism):
         heat = np.where(on, self.flow_W(jacket, q), 0.0)
         before, now, held = jacket[..., :-1], jacket[..., 1:], {k: v[..., 1:] for k, v in q.items()}
         turned = on[..., 1:].astype(int) - on[..., :-1]  # 1: came on within the interval before, -1: went off
-        crossing = np.where(turned == 0, now, held["set_point"] + turned * held["hysteresis"])
-        since = (now - crossing) / np.where(turned == 0, 1.0, now - before)  # share of that interval
+        moved = now - before
+        crossed = (turned != 0) & (moved != 0)  # a set point that follows the room may pass a jacket that stands still
+        crossing = np.where(crossed, held["set_point"] + turned * held["hysteresis"], now)
+        since = (now - crossing) / np.where(crossed, moved, 1.0)  # share of that interval
         # flow is linear in temperature: its mean since the crossing is the flow at the mean temperature
         missed_W = turned * since * self.flow_W((crossing + now) / 2, held)
         missed_W = missed_W * step_s[..., :-1] / step_s[..., 1:]

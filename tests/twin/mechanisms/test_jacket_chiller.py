@@ -55,6 +55,13 @@ def test_period_duty_and_mean_flow_are_those_of_the_closed_form(step_s: float, t
     assert (heat_W[cycles] < 0.2 * mean_W).mean() == pytest.approx(duty, rel=3 * tolerance)
 
 
+def test_a_set_point_that_passes_a_still_jacket_switches_the_coolant_on() -> None:
+    room = np.array([20.0, 20.0, 17.0, 17.0])
+    view = View(degC={"jacket": np.full(4, 22.0), "room": room}, time_s=60.0 * np.arange(4))
+    heat_W = JacketChiller().heat_W(view, P | {"follow": np.asarray(1.0)})
+    assert heat_W.tolist() == [0.0, 0.0, 150.0 * (13.0 - 22.0), 150.0 * (13.0 - 22.0)]
+
+
 def sawtooth(period_s: float, step_s: float, hours: float) -> tuple[Any, Any]:
     """A triangle between 20.5 and 23.5 degC, linear as the law assumes, and its times."""
     time_s = np.arange(0.0, hours * 3600, step_s)
