@@ -201,13 +201,7 @@ class Lake:
         if not reason.strip():
             raise InputError("withdraw: the reason is empty; state why the batches are not to be used")
 
-        def edit(batches: Batches) -> tuple[list[str], set[str]]:
-            where = f"lake {self.name}: {machine} has no batch in use that fits"
-            ids = listing.chosen(list(listing.active(batches)), batch_ids, where)
-            listing.withdraw(batches, ids, reason.strip(), _now())
-            return ids, set(ids)
-
-        return self._change(machine, edit, known=True)
+        return self._edit(machine, batch_ids, "in use", lambda b, ids: listing.withdraw(b, ids, reason.strip(), _now()))
 
     def forget_machine(self, machine: str, reason: str) -> list[str]:
         """Withdraw every batch of a machine; see `withdraw`."""
@@ -222,13 +216,7 @@ class Lake:
             InputError: an unknown machine, or no withdrawn batch fits one of `batch_ids`.
             WorkError: see `put`.
         """
-
-        def edit(batches: Batches) -> tuple[list[str], set[str]]:
-            ids = self._withdrawn(batches, machine, batch_ids)
-            listing.restore(batches, ids)
-            return ids, set(ids)
-
-        return self._change(machine, edit, known=True)
+        return self._edit(machine, batch_ids, "withdrawn", listing.restore)
 
     def purge(self, machine: str, batch_ids: Sequence[str], quarantined: bool = False) -> list[str]:
         """Delete the content of withdrawn batches for good; reason, source and digest stay, and keep them out.
@@ -242,13 +230,7 @@ class Lake:
             InputError: an unknown machine, or no withdrawn batch fits one of `batch_ids`.
             WorkError: see `put`.
         """
-
-        def edit(batches: Batches) -> tuple[list[str], set[str]]:
-            ids = self._withdrawn(batches, machine, batch_ids)
-            listing.purge(batches, ids, _now())
-            return ids, set(ids)
-
-        ids = self._change(machine, edit, known=True)
+        ids = self._edit(machine, batch_ids, "withdrawn", lambda b, ids: listing.purge(b, ids, _now()))
         if quarantined:
             with self._writing():
                 folder = _quarantine(machine)
@@ -475,10 +457,19 @@ class Lake:
             return None
         return sha256 if sha256 == noted else None
 
-    def _withdrawn(self, batches: Batches, machine: str, batch_ids: Sequence[str]) -> list[str]:
-        """The ids with withdrawn versions among those wanted."""
-        gone = [i for i, entries in batches.items() if any("withdrawn" in e for e in entries)]
-        return listing.chosen(gone, batch_ids, f"lake {self.name}: {machine} has no withdrawn batch that fits")
+    def _edit(
+        self, machine: str, wanted: Sequence[str], state: str, change: Callable[[Batches, list[str]], None]
+    ) -> list[str]:
+        """Change the batches among those wanted that are "in use", or have "withdrawn" versions; their ids."""
+
+        def edit(batches: Batches) -> tuple[list[str], set[str]]:
+            gone = [i for i, entries in batches.items() if any("withdrawn" in e for e in entries)]
+            found = ([*listing.active(batches)], "batch in use") if state == "in use" else (gone, "withdrawn batch")
+            ids = listing.chosen(found[0], wanted, f"lake {self.name}: {machine} has no {found[1]} that fits")
+            change(batches, ids)
+            return ids, set(ids)
+
+        return self._change(machine, edit, known=True)
 
     def _change(self, machine: str, edit: Callable[[Batches], tuple[R, set[str]]], known: bool = False) -> R:
         """Change a machine's batches and commit that, then let the current files of the changed batches follow.

@@ -79,6 +79,10 @@ class Table:
         """The strptime patterns that fit, if the clock is of time stamps."""
         return self.clock.stamps
 
+    def title(self, i: int) -> str:
+        """The header of a column, "" without any."""
+        return self.columns[i] if self.header else ""
+
     def key(self, i: int) -> str | int:
         """How a machine file names a column: its header, or its place where that is empty or not the only one."""
         name = normalise(self.columns[i])

@@ -176,6 +176,12 @@ class Check:
     ) -> Finding:
         return Finding(self.key, channel, message, start_s, end_s, masks)
 
+    def in_rows(
+        self, batch: Batch, channel: str | None, first: int, last: int, message: str, masks: bool = True
+    ) -> Finding:
+        """A finding from the time of row `first` to that of row `last`."""
+        return self.finding(channel, message, float(batch.time_s[first]), float(batch.time_s[last]), masks)
+
 
 def overrule_line(channel: str, check: str, batch_id: str = "") -> str:
     """The entry of the machine file's `overrule` list that lifts a check's masks of a channel."""

@@ -50,8 +50,7 @@ class Copied(Check):
                 f"as batch {other.batch_id}: a copy, or a longer export of the same run; withdraw the shorter one "
                 f"(`thermodrift lake withdraw {batch.machine} {shorter.batch_id} --reason TEXT`)"
             )
-            start_s, end_s = float(batch.time_s[copied[0]]), float(batch.time_s[last])
-            found[k] = [self.finding(None, message, start_s, end_s, masks=False)]
+            found[k] = [self.in_rows(batch, None, int(copied[0]), last, message, masks=False)]
         return found
 
 
