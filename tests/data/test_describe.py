@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from types import SimpleNamespace
 
 import numpy as np
 import openpyxl
@@ -14,7 +13,7 @@ from data import guess
 from data.describe import draft_machine_file, notes
 from data.errors import InputError
 from data.machine import parse_machine
-from data.peek import look_at
+from data.peek import look
 from data.recording import read_batches, recording_files
 
 
@@ -41,6 +40,13 @@ def run(seed: int, n: int = 400) -> pd.DataFrame:
 def draft(files):
     text = draft_machine_file(files)
     return text, parse_machine(text, "draft")
+
+
+def draft_of(folder, table):
+    """The draft of one table, and what it reads of it."""
+    table.to_csv(folder / "a.csv", index=False)
+    text, machine = draft([folder / "a.csv"])
+    return text, machine, next(read_batches(folder / "a.csv", machine))
 
 
 @pytest.mark.parametrize("suffix", ["csv", pytest.param("xlsx", marks=pytest.mark.slow), "parquet"])
@@ -79,8 +85,7 @@ def test_draft_reads_the_files_it_was_drafted_from(tmp_path, suffix):
 
 
 def test_every_guess_is_marked_on_its_line_and_in_the_list(tmp_path):
-    run(1).to_csv(tmp_path / "a.csv", index=False)
-    text, machine = draft([tmp_path / "a.csv"])
+    text, machine, _ = draft_of(tmp_path, run(1))
     for name, part in machine.channels.items():
         block = re.search(rf'\n  "?{re.escape(name)}"?:\n((?:    .*\n)+)', text)[1]
         marked = set(re.findall(r"^    (\w+):.*# guessed: \S", block, re.M))
@@ -173,11 +178,9 @@ def warm_up(clock: str, step: float = 1.0, n: int = 300, **more) -> pd.DataFrame
 )  # fmt: skip
 def test_the_unit_of_time_is_read_from_the_header(tmp_path, clock, unit):
     per_minute = {"s": 60, "min": 1, "h": 1 / 60, "ms": 60_000, "d": 1 / 1440}[unit]
-    warm_up(clock, per_minute).to_csv(tmp_path / "a.csv", index=False)
-    text, machine = draft([tmp_path / "a.csv"])
+    text, machine, batch = draft_of(tmp_path, warm_up(clock, per_minute))
     assert (machine.recording.time.column, machine.recording.time.unit) == (clock, unit)
     assert machine.recording.step_s == 60 and "# check" not in text
-    (batch,) = read_batches(tmp_path / "a.csv", machine)
     assert batch.time_s[-1] == pytest.approx(299 * 60)
 
 
@@ -195,8 +198,7 @@ def test_the_unit_of_time_is_read_from_the_header(tmp_path, clock, unit):
     ],
 )
 def test_an_unknown_or_implausible_unit_of_time_is_pointed_out(tmp_path, clock, step, unit, words):
-    warm_up(clock, step).to_csv(tmp_path / "a.csv", index=False)
-    text, machine = draft([tmp_path / "a.csv"])
+    text, machine, _ = draft_of(tmp_path, warm_up(clock, step))
     assert machine.recording.time.unit == unit
     (said,) = notes(text)
     assert said.startswith(words)
@@ -219,23 +221,14 @@ def test_without_a_clock_the_draft_asks_for_the_step(tmp_path, counter):
     assert batch.time_s.tolist() == [60.0 * i for i in range(300)]
 
 
-def test_columns_that_are_no_clock():
+def test_columns_that_are_no_clock(tmp_path):
     rng = np.random.default_rng(5)
     warm = 20 + 12 * (1 - np.exp(-np.arange(400) / 60))
     for header, values in (("T9", 20 + np.arange(400) * 1e-4), ("Weg", np.arange(400.0)), ("a", warm),
                            ("a", np.cumsum(rng.exponential(1, 400)))):  # fmt: skip
-        body = [[v, 1.0] for v in values.tolist()]
-        sheet = SimpleNamespace(
-            head=[[header, "b"], *body],
-            decimal=".",
-            summary="",
-            name="",
-            units=(),
-            origin_s=0.0,
-            step_s=None,
-            first_row=None,
-        )
-        assert look_at(sheet, "test").time is None
+        pd.DataFrame({header: values, "b": 1.0}).to_csv(tmp_path / "a.csv", index=False)
+        (table,) = look(tmp_path / "a.csv")
+        assert table.time is None
 
 
 @pytest.mark.parametrize(
@@ -281,11 +274,8 @@ def test_dates_and_times_of_day_in_two_columns(tmp_path, suffix, start):
 
 
 def test_serial_numbers_of_a_workbook_are_time_stamps(tmp_path):
-    warm_up("Time").assign(Time=44352.25 + np.arange(300) / 1440).to_csv(tmp_path / "a.csv", index=False)
-    _, machine = draft([tmp_path / "a.csv"])
-    (batch,) = read_batches(tmp_path / "a.csv", machine)
-    warm_up("Ora").assign(Ora=1.7e9 + 60.0 * np.arange(300)).to_csv(tmp_path / "b.csv", index=False)
-    _, of_unix = draft([tmp_path / "b.csv"])
+    _, machine, batch = draft_of(tmp_path, warm_up("Time").assign(Time=44352.25 + np.arange(300) / 1440))
+    _, of_unix, _ = draft_of(tmp_path, warm_up("Ora").assign(Ora=1.7e9 + 60.0 * np.arange(300)))
     assert of_unix.recording.time.unit == "timestamp" and of_unix.recording.step_s == 60
     assert batch.start.round("s") == pd.Timestamp("2021-06-05 06:00") and machine.recording.step_s == 60
 
@@ -304,8 +294,7 @@ def test_codes_for_no_value_are_no_readings(tmp_path):
     table = warm_up("Minutes")
     table.loc[50:54, "Spindle temp"] = -999
     table.loc[7, "dz [um]"] = 3.4e38
-    table.to_csv(tmp_path / "a.csv", index=False)
-    text, machine = draft([tmp_path / "a.csv"])
+    text, machine, _ = draft_of(tmp_path, table)
     assert notes(text) == [
         "column 'Spindle temp': -999 (5×) is taken for a missing value",
         "column 'dz [um]': 3.4e+38 (1×) is taken for a missing value",

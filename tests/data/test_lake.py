@@ -1,8 +1,6 @@
 """The lake against plain readers, plain copies of what was put, and random histories."""
 
 import io
-import subprocess
-import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -324,16 +322,6 @@ def test_any_history_is_kept(steps: list[tuple[str, str, int, str | None]]) -> N
                 assert [v.digest for v in listed] == [content_digest(b) for b in versions]
         kept = {(e.name, e.copy.read_text()) for e in lake.quarantined("vmc") if e.copy}
         assert kept == junk
-
-
-def test_hidden_folders_stay_out_of_a_cold_interpreter(tmp_path: Path) -> None:
-    """A reader that has never heard of the lake: one row per stored row, whatever versions lie there."""
-    lake = Lake(tmp_path)
-    for seed in range(3):
-        lake.put(make(seed=seed))
-    code = f"import pandas; print(len(pandas.read_parquet({str(tmp_path)!r})))"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.strip() == "5"
 
 
 def test_a_write_touches_the_manifest_of_its_machine_alone(tmp_path: Path) -> None:

@@ -51,6 +51,12 @@ def only(path: Path, machine: Machine):
     return batch
 
 
+def of_text(folder: Path, text: str, unit: str = "s"):
+    """The batch of a file with the columns t, front and z."""
+    (folder / "run.csv").write_text(text)
+    return only(folder / "run.csv", machine_for("t", "front", "z", unit=unit))
+
+
 def cell(x: float, decimal: str) -> str:
     return "" if np.isnan(x) else repr(float(x)).replace(".", decimal)
 
@@ -137,11 +143,9 @@ def test_xlsx_and_parquet_give_what_csv_gives(tmp_path, rows):
 
 
 def test_text_cells_are_read_where_one_reading_is_possible_else_counted(tmp_path):
-    path = tmp_path / "run.csv"
     cells = ["1,5", "1.234,5", "n/a", "---", "2.345", " 7 ", "NaN", "", "-1,2e1", "OL", "1e999", "3"]
     read = [1.5, 1234.5, None, None, None, 7.0, None, None, -12.0, None, None, 3.0]
-    path.write_text("t;front;z\n" + "".join(f"{10 * i};{c};{i},5\n" for i, c in enumerate(cells)))
-    batch = only(path, machine_for("t", "front", "z"))
+    batch = of_text(tmp_path, "t;front;z\n" + "".join(f"{10 * i};{c};{i},5\n" for i, c in enumerate(cells)))
     known = [i for i, x in enumerate(read) if x is not None]
     assert batch.values("front")[known].tolist() == [read[i] for i in known]
     assert batch.values("z").tolist() == [i + 0.5 for i in range(12)]
@@ -162,9 +166,7 @@ def test_one_cell(text, decimal, value):
 
 
 def test_trailing_separators_blank_lines_and_cut_rows(tmp_path):
-    path = tmp_path / "run.csv"
-    path.write_text("t,front,z\n0,20,1,\n\n10,21,2,\n20,22,3,\n30,23\n40,24,5,\n50,2")
-    batch = only(path, machine_for("t", "front", "z"))
+    batch = of_text(tmp_path, "t,front,z\n0,20,1,\n\n10,21,2,\n20,22,3,\n30,23\n40,24,5,\n50,2")
     assert batch.values("z").tolist() == [1, 2, 3, 4, 5]
     assert batch.repairs["ragged_rows"] == 2
     assert batch.repairs["rows_in"] == 6
@@ -172,11 +174,9 @@ def test_trailing_separators_blank_lines_and_cut_rows(tmp_path):
 
 
 def test_a_lone_quote_loses_no_row_silently(tmp_path):
-    path = tmp_path / "run.csv"
     rows = [f'{10 * i},"20",{i}' for i in range(40)]
     rows[20] = '200,"20,20'
-    path.write_text("t,front,z\n" + "\n".join(rows) + "\n")
-    batch = only(path, machine_for("t", "front", "z"))
+    batch = of_text(tmp_path, "t,front,z\n" + "\n".join(rows) + "\n")
     assert batch.repairs["rows_in"] == 40 == batch.repairs["rows_used"] + batch.repairs["rows_dropped"]
 
 
@@ -239,18 +239,14 @@ def test_timestamps_as_text(tmp_path, pattern):
 def test_day_and_month_that_cannot_be_told_apart_are_asked_for(tmp_path):
     assert len(stamp_formats(["05/06/2024 10:00", "05/06/2024 10:01"])) == 2
     assert stamp_formats(["13/06/2024 10:00", "13/06/2024 10:01"]) == ["%d/%m/%Y %H:%M"]
-    path = tmp_path / "run.csv"
-    path.write_text("t,front,z\n05/06/2024 10:00,20,1\n05/06/2024 10:01,20,2\n")
     with pytest.raises(InputError, match=r"'%d/%m/%Y %H:%M' or '%m/%d/%Y %H:%M'; set recording.time.format"):
-        only(path, machine_for("t", "front", "z", unit="timestamp"))
+        of_text(tmp_path, "t,front,z\n05/06/2024 10:00,20,1\n05/06/2024 10:01,20,2\n", "timestamp")
 
 
 def test_stamps_with_an_offset_do_not_jump_with_summer_time(tmp_path):
-    path = tmp_path / "run.csv"
-    path.write_text(
-        "t,front,z\n2024-10-27T02:59:50+02:00,20,1\n2024-10-27T02:00:00+01:00,20,2\n2024-10-27T02:00:10+01:00,20,3\n"
-    )
-    batch = only(path, machine_for("t", "front", "z", unit="timestamp"))
+    stamps = ("2024-10-27T02:59:50+02:00", "2024-10-27T02:00:00+01:00", "2024-10-27T02:00:10+01:00")
+    rows = "".join(f"{stamp},20,{i}\n" for i, stamp in enumerate(stamps, 1))
+    batch = of_text(tmp_path, f"t,front,z\n{rows}", "timestamp")
     assert batch.values("z").tolist() == [1, 2, 3]
     assert batch.start == pd.Timestamp("2024-10-27 02:59:50")  # as the wall clock shows it
 
@@ -350,8 +346,6 @@ def test_random_corruption_gives_a_batch_or_one_clear_line(tmp_path, kind, cut, 
 
 def test_a_block_without_any_whole_row(tmp_path, monkeypatch):
     monkeypatch.setattr("data.readers.csv._BLOCK_BYTES", 32)
-    path = tmp_path / "run.csv"
-    path.write_text("t,front,z\n" + "0,1\n" * 20 + "".join(f"{10 * i},20,{i}\n" for i in range(50)))
-    batch = only(path, machine_for("t", "front", "z"))
+    batch = of_text(tmp_path, "t,front,z\n" + "0,1\n" * 20 + "".join(f"{10 * i},20,{i}\n" for i in range(50)))
     assert batch.values("z").tolist() == list(range(50))
     assert (batch.repairs["ragged_rows"], batch.repairs["rows_in"]) == (20, 70)
