@@ -67,15 +67,10 @@ class Quarantined:
     copy: Path | None
 
 
-def log_text(entries: list[Quarantined]) -> str:
-    """One JSON line per entry."""
-    rows: list[dict[str, Any]] = [{**asdict(e), "copy": e.copy.name if e.copy else None} for e in entries]
-    return "".join(json.dumps(row) + "\n" for row in rows)
-
-
-def entry_for(path: Path, machine: str, reason: str, folder: Path, name: str) -> Quarantined:
+def _quarantined(path: Path, machine: str, reason: str, folder: Path) -> Quarantined:
     """The log entry for `path`, with the hash of its bytes; writes nothing. A large file gets no copy."""
     sha256, copy = "", None
+    name = safe_name(path.name.encode("utf-8", "backslashreplace").decode())  # undecodable bytes escaped
     try:
         with path.open("rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
@@ -86,11 +81,6 @@ def entry_for(path: Path, machine: str, reason: str, folder: Path, name: str) ->
     except OSError as error:
         reason = f"{reason} (no copy kept: its bytes cannot be read, {error.strerror})"
     return Quarantined(machine, path.name, str(path), sha256, reason, _now(), copy)
-
-
-def ascii_if_broken(name: str) -> str:
-    """A file name with undecodable bytes escaped."""
-    return name.encode("utf-8", "backslashreplace").decode()
 
 
 class Lake:
@@ -321,7 +311,7 @@ class Lake:
         with self._writing():
             held, found = set(self._store.files(folder)), list[Quarantined]()
             for path, reason in refused:
-                entry = entry_for(path, machine, reason, at, safe_name(ascii_if_broken(path.name)))
+                entry = _quarantined(path, machine, reason, at)
                 if entry.copy is not None and entry.copy.name not in held:
                     self._store.write(f"{folder}/{entry.copy.name}", path, private=True)
                     held.add(entry.copy.name)
@@ -332,7 +322,9 @@ class Lake:
                 entries = self._entries_of(raw, folder)
                 known = {replace(e, at="") for e in entries}
                 entries += [e for e in dict.fromkeys(found) if replace(e, at="") not in known]
-                if self._store.swap(f"{folder}/{LOG}", log_text(entries).encode(), stamp, private=True):
+                rows = [{**asdict(e), "copy": e.copy.name if e.copy else None} for e in entries]
+                log = "".join(json.dumps(row) + "\n" for row in rows)
+                if self._store.swap(f"{folder}/{LOG}", log.encode(), stamp, private=True):
                     break
                 again()
         return kept

@@ -102,7 +102,7 @@ def look(path: Path, form: Form | None = None) -> list[Table]:
     with sheets_of(path, (), form) as sheets:
         for sheet in sheets:
             try:
-                tables.append(look_at(sheet, path.name, form))
+                tables.append(_look_at(sheet, path.name, form))
             except InputError as error:
                 problems.append(error)
         pivot = _pivot(sheets[0], tables[0]) if len(sheets) == len(tables) == 1 and form.pivot is None else None
@@ -114,9 +114,7 @@ def look(path: Path, form: Form | None = None) -> list[Table]:
     return tables
 
 
-def look_at(sheet: Sheet, where: str, form: Form | None = None) -> Table:
-    """Structure of one sheet. Raises InputError as `look`."""
-    form = form or Form()
+def _look_at(sheet: Sheet, where: str, form: Form) -> Table:
     first = _first_row(sheet, where, form)
     width = len(sheet.head[first])
     header, units = _headers(sheet, first, width, form)
