@@ -284,7 +284,7 @@ def _measured(batch: Batch) -> set[str]:
 
 
 def _hashes(batch: Batch, names: Sequence[str]) -> NDArray[np.uint64]:
-    """The hash of each row and the `_HASHED_ROWS` - 1 behind it, (n - _HASHED_ROWS + 1,); 0 where few of them change."""
+    """The hash of each row and the `_HASHED_ROWS` - 1 behind it, (n - _HASHED_ROWS + 1,); 0 where few change."""
     if batch.n_rows < _HASHED_ROWS:
         return np.zeros(0, np.uint64)
     row = np.zeros(batch.n_rows, np.uint64)

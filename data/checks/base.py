@@ -110,11 +110,11 @@ def signals(batch: Batch) -> Signals:
     return kept
 
 
-def excess(values: Array, half: int = 4) -> Array:
+def excess(values: Array) -> Array:
     """Step into each row less the median step of the rows around it, shape (n,); row 0 is 0, NaN next to holes."""
     steps = np.diff(values, prepend=values[:1])
     steps[:1] = 0.0
-    return steps - rolling_median(steps, half)
+    return steps - rolling_median(steps, half=4)
 
 
 def rolling_median(values: Array, half: int, least: int = 1) -> Array:

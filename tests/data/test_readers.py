@@ -311,39 +311,6 @@ def test_unknown_suffix_lists_the_known_ones():
     assert type(reader_for(Path("RUN.CSV"))) is READERS["csv"]
 
 
-@pytest.mark.slow
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    kind=st.sampled_from(["csv", "xlsx", "parquet"]),
-    cut=st.floats(0, 1),
-    patches=st.lists(st.tuples(st.floats(0, 1), st.binary(min_size=1, max_size=6)), max_size=4),
-    unit=st.sampled_from(["s", "timestamp"]),
-)
-def test_random_corruption_gives_a_batch_or_one_clear_line(tmp_path, kind, cut, patches, unit):
-    path = tmp_path / f"run.{kind}"
-    frame = pd.DataFrame({"t": np.arange(60) * 10.0 + 1.7e9, "front": 20.0 + np.arange(60) / 10, "z": np.arange(60.0)})
-    if kind == "csv":
-        frame.to_csv(path, index=False)
-    elif kind == "xlsx":
-        frame.to_excel(path, index=False)
-    else:
-        frame.to_parquet(path)
-    raw = bytearray(path.read_bytes())
-    for where, patch in patches:
-        at = int(where * len(raw))
-        raw[at : at + len(patch)] = patch
-    path.write_bytes(bytes(raw[: max(1, int(len(raw) * (cut if cut < 0.9 else 1.0)))]))
-    try:
-        for batch in read_batches(path, machine_for("t", "front", "z", unit=unit)):
-            repairs = batch.repairs
-            assert repairs["rows_in"] == repairs["rows_used"] + repairs["rows_dropped"]
-            assert batch.n_rows == repairs["rows_out"] >= 2
-            assert np.isfinite(batch.values("z")).any()
-            assert np.allclose(np.diff(batch.time_s), 10.0)
-    except InputError as error:
-        assert str(error).startswith("run.") and "\n" not in str(error)
-
-
 def test_a_block_without_any_whole_row(tmp_path, monkeypatch):
     monkeypatch.setattr("data.readers.csv._BLOCK_BYTES", 32)
     batch = of_text(tmp_path, "t,front,z\n" + "0,1\n" * 20 + "".join(f"{10 * i},20,{i}\n" for i in range(50)))
