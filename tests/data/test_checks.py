@@ -61,10 +61,8 @@ SEEDS = range(6)
 
 @pytest.mark.parametrize("step_s", [pytest.param(60.0, marks=pytest.mark.slow), 300.0])
 def test_clean_batches_raise_nothing(step_s: float) -> None:
-    machine = toy_machine()
-    batches = [toy_batch(seed, step_s) for seed in range(30)]
-    batches = [b.with_findings(check_batch(b, machine)) for b in batches]
-    assert [f.message for b in check_machine(batches, machine) for f in b.findings] == []
+    known = on_the_machine([toy_batch(seed, step_s) for seed in range(30)])
+    assert [f.message for b in known for f in b.findings] == []
 
 
 @pytest.mark.parametrize("check", [c for key in CHECKS for c in check_check(key, generate_only=True)], ids=str)
@@ -361,9 +359,7 @@ def test_the_machine_file_overrules() -> None:
         Overrule(batch="b01", channel="x", mask=True, start_s=600.0, end_s=1200.0, reason="probe touched"),
     ]
     machine = toy_machine(overrule=rules)
-    bad = added(toy_batch(0), "bed", 30, None, 15.0)
-    batches = [b.with_findings(check_batch(b, machine)) for b in (bad, toy_batch(1))]
-    once = check_machine(batches, machine)
+    once = on_the_machine([added(toy_batch(0), "bed", 30, None, 15.0), toy_batch(1)], machine)
     assert [f.overruled for f in once[0].findings] == ["sensor was moved on purpose"]
     assert np.isfinite(once[0].masked("bed")).all()
     assert np.flatnonzero(np.isnan(once[1].masked("x"))).tolist() == [2, 3, 4]
@@ -373,8 +369,7 @@ def test_the_machine_file_overrules() -> None:
 
 def test_an_overrule_outside_its_time_leaves_the_mask() -> None:
     machine = toy_machine(overrule=[Overrule(channel="bed", end_s=600.0, reason="early only")])
-    bad = added(toy_batch(0), "bed", 30, None, 15.0)
-    known = check_machine([bad.with_findings(check_batch(bad, machine))], machine)
+    known = on_the_machine([added(toy_batch(0), "bed", 30, None, 15.0)], machine)
     assert np.isnan(known[0].masked("bed")[30:]).all()
 
 

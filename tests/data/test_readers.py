@@ -208,15 +208,9 @@ def test_encoding_is_settled_by_the_expected_names(tmp_path):
         assert tuple(c.strip("\ufeff") for c in unaided) == names, encoding
 
 
-STAMPS = {
-    "%Y-%m-%d %H:%M:%S": None,
-    "%Y-%m-%dT%H:%M:%S.%f": None,
-    "%d.%m.%Y %H:%M:%S": None,
-    "%Y/%m/%d %H:%M": None,
-    "%Y年%m月%d日 %H:%M:%S": None,
-    "%H:%M:%S": None,
-    "%d%m%y-%H%M%S": "%d%m%y-%H%M%S",
-}
+STAMPS = ("%Y-%m-%d %H:%M:%S", "%Y-%m-%dT%H:%M:%S.%f", "%d.%m.%Y %H:%M:%S", "%Y/%m/%d %H:%M", "%Y年%m月%d日 %H:%M:%S",
+          "%H:%M:%S", "%d%m%y-%H%M%S")  # fmt: skip
+UNKNOWN = STAMPS[-1]  # must be given
 
 
 @pytest.mark.parametrize("pattern", STAMPS)
@@ -225,7 +219,7 @@ def test_timestamps_as_text(tmp_path, pattern):
     stamps = [begin + pd.Timedelta(minutes=i) for i in range(6)]
     path = tmp_path / "run.csv"
     path.write_text("t;front;z\n" + "".join(f"{s.strftime(pattern)};20,5;{i},5\n" for i, s in enumerate(stamps)))
-    text = f"unit: timestamp, format: '{STAMPS[pattern]}'" if STAMPS[pattern] else "unit: timestamp"
+    text = "unit: timestamp" + f", format: '{pattern}'" * (pattern == UNKNOWN)
     machine = parse_machine(
         f"{{machine: mill, recording: {{time: {{column: t, {text}}}, step_s: 60}}, channels: {{"
         "front: {role: temperature, unit: degC}, z: {role: error, unit: um}}}",
