@@ -67,7 +67,7 @@ class Quarantined:
     copy: Path | None
 
 
-def _quarantined(path: Path, machine: str, reason: str, folder: Path) -> Quarantined:
+def _log_entry(path: Path, machine: str, reason: str, folder: Path) -> Quarantined:
     """The log entry for `path`, with the hash of its bytes; writes nothing. A large file gets no copy."""
     sha256, copy = "", None
     name = safe_name(path.name.encode("utf-8", "backslashreplace").decode())  # undecodable bytes escaped
@@ -311,7 +311,7 @@ class Lake:
         with self._writing():
             held, found = set(self._store.files(folder)), list[Quarantined]()
             for path, reason in refused:
-                entry = _quarantined(path, machine, reason, at)
+                entry = _log_entry(path, machine, reason, at)
                 if entry.copy is not None and entry.copy.name not in held:
                     self._store.write(f"{folder}/{entry.copy.name}", path, private=True)
                     held.add(entry.copy.name)
