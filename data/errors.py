@@ -22,11 +22,6 @@ def place_of(error: OSError, otherwise: object) -> object:
     return error.filename2 or error.filename or otherwise
 
 
-def first_line(error: BaseException) -> str:
-    """The first line of an error's text, or its kind where it has none."""
-    return (str(error).splitlines() or [type(error).__name__])[0]
-
-
 def closest(got: str, allowed: Iterable[str]) -> str:
     """Suggestion for an unknown name with all allowed ones: ``did you mean 'ridge'? Allowed: bp, ridge``."""
     names = sorted(allowed)

@@ -20,7 +20,7 @@ from typing import Any, Protocol
 
 from filelock import FileLock, Timeout
 
-from data.errors import InputError, first_line, masked
+from data.errors import InputError, masked
 
 LOCK_WAIT_S = 600.0  # for another writer
 ANSWER_S = 10.0  # for an object store to answer at all
@@ -212,7 +212,7 @@ class Bucket:
             raise InputError(f"lake {self.name}: obstore is not installed; run {_INSTALL}") from None
         except Exception as error:  # obstore's own, of no common class with a meaning
             raise InputError(
-                f"lake {self.name}: no place that obstore knows ({masked(first_line(error))}); expected a folder or "
+                f"lake {self.name}: no place that obstore knows ({masked(_first_line(error))}); expected a folder or "
                 "an address such as s3://bucket/lake"
             ) from None
 
@@ -305,7 +305,7 @@ class Bucket:
         except (OSError, obstore.exceptions.AlreadyExistsError, obstore.exceptions.PreconditionError):
             raise
         except Exception as error:
-            raise OSError(first_line(error)) from None
+            raise OSError(_first_line(error)) from None
 
 
 @cache
@@ -332,6 +332,10 @@ def _opened(address: str) -> Any:
 
 def _stamp(meta: Any) -> Stamp:
     return tuple((k, meta.get(k)) for k in ("e_tag", "version"))
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def open_store(root: Path | str) -> Store:
