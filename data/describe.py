@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from data import guess
 from data.errors import InputError
-from data.groups import FILL_IN, Clock, Group, Joint, files_pattern, grouped, joint
+from data.groups import FILL_IN, Group, files_pattern, grouped, joint
 from data.guess import Guess, PositionGroup
 from data.machine import Form, Machine, Split, parse_machine
 from data.recording import read_batches
 from data.rows import cut_runs
-from data.units import conversion, convert, quantity, stated_unit
+from data.units import conversion, convert, quantity
 from data.yaml_edit import flow
 
 _MANY_DROPPED = 0.1  # of a recording's rows: the draft cannot be right
@@ -56,24 +56,30 @@ def drafted(files: Sequence[Path], form: Form | None = None) -> tuple[str, dict[
     """
     if not files:
         raise InputError("describe: no files given, expected recordings of one machine; name at least one")
-    (main, *others), left_out = grouped(files, form)
-    joined: dict[str, tuple[Group, Joint]] = {}
+    groups, left_out = _belonging(*grouped(files, form))
+    text = _write(groups, left_out, {p.name for p in files} - {p.name for p in groups[0].paths})
+    machine = parse_machine(text.replace(FILL_IN, "1 s"), "draft")
+    if FILL_IN not in text and (trouble := _tried(groups[0].paths[0], machine)):
+        text = f"{CHECK}{trouble}\n{text}"
+    return text, {g.paths[0].name: _shown(g, machine) for g in groups}
+
+
+def _belonging(found: list[Group], left_out: list[str]) -> tuple[list[Group], list[str]]:
+    """The recordings and the groups that are joined to them, and a line for each file that is left out."""
+    main, *others = found
+    groups = [main]
     for other in others:
         if (how := joint(main, other)) is not None:
-            joined[_key(other, [*joined])] = other, how
-        else:
-            first = next((p.name for p, _ in main.tables if p not in other.paths), main.paths[0].name)
-            left_out += [
-                f"{path.name}{f' sheet {table.sheet!r}' * (path in main.paths)}: its columns are others than those of"
-                f" {first}"
-                for path, table in other.tables
-            ]
-    text = _write(main, joined, left_out, {p.name for p in files} - {p.name for p in main.paths})
-    machine = parse_machine(text.replace(FILL_IN, "1 s"), "draft")
-    if FILL_IN not in text and (trouble := _tried(main.paths[0], machine)):
-        text = f"{CHECK}{trouble}\n{text}"
-    groups = {"file": main, **{key: group for key, (group, _) in joined.items()}}
-    return text, {g.paths[0].name: _shown(g, key, machine) for key, g in groups.items()}
+            other.joint, other.key = how, _key(other, [g.key for g in groups[1:]])
+            groups.append(other)
+            continue
+        first = next((p.name for p, _ in main.tables if p not in other.paths), main.paths[0].name)
+        left_out += [
+            f"{path.name}{f' sheet {table.sheet!r}' * (path in main.paths)}: its columns are others than those of"
+            f" {first}"
+            for path, table in other.tables
+        ]
+    return groups, left_out
 
 
 def _tried(path: Path, machine: Machine) -> str:
@@ -88,10 +94,10 @@ def _tried(path: Path, machine: Machine) -> str:
     return f"ingest drops {dropped} of {read} rows of {path.name}" if dropped > _MANY_DROPPED * read else ""
 
 
-def _shown(group: Group, source: str, machine: Machine) -> list[Shown]:
+def _shown(group: Group, machine: Machine) -> list[Shown]:
     table = group.table
     parts = {part.column if part.column is not None else n: (n, part) for n, part in machine.channels.items()
-             if part.source == source}  # fmt: skip
+             if part.source == group.key}  # fmt: skip
     name_of = {i: name for name, i in group.names.items()}
     out = []
     for i, column in enumerate(table.columns):
@@ -124,18 +130,18 @@ def _key(group: Group, taken: Sequence[str]) -> str:
     return name if name not in taken else f"{name}_{len(taken) + 1}"
 
 
-def _write(main: Group, joined: dict[str, tuple[Group, Joint]], left_out: Sequence[str], others: set[str]) -> str:
-    groups = {"file": main, **{key: group for key, (group, _) in joined.items()}}
-    fine: dict[str, tuple[dict[str, Guess], float]] = {key: _linked(g) for key, g in groups.items()}
+def _write(groups: Sequence[Group], left_out: Sequence[str], others: set[str]) -> str:
+    main, *joined = groups
+    linked = [_linked(g) for g in groups]
     channels: list[str] = []
     taken: list[str] = []
-    for key, group in groups.items():
-        channels += _channels(group, fine[key][0], key, taken)
+    for group, (along, _) in zip(groups, linked, strict=True):
+        channels += _channels(group, along, taken)
     runs = _runs(main)
     files = [p.name for p in main.paths]
     folder = re.sub(r"[^a-z0-9_\-]+", "_", main.paths[0].resolve().parent.name.lower()).strip("_-") or "machine"
-    doubts = [(g, note) for g in groups.values() for note in (g.clock.note, *g.notes) if note]
-    patterns = [next((how.files for _, how in joined.values() if how.files), None) or files_pattern(main.paths)]
+    doubts = [(g, note) for g in groups for note in (g.clock.note, *g.notes) if note]
+    patterns = [next((g.joint.files for g in joined if g.joint and g.joint.files), None) or files_pattern(main.paths)]
     if fnmatch.filter(others, patterns[0]):  # those are no recordings
         patterns = files
     lines = [
@@ -147,33 +153,29 @@ def _write(main: Group, joined: dict[str, tuple[Group, Joint]], left_out: Sequen
         *(["simulated: true  # a line of the file says so"] if main.table.simulated else []),
         "recording:",
         f"  files: {flow(patterns)}  # guessed: the names of the files",
-        f"  header: {'true' if main.table.header else 'false'}",
-        *(f"  {key}: {flow(value)}" for key, value in _stated(main.table.form).items()),
-        f"  time: {_time(main.clock)}",
-        *_steps([*groups.values()], min(step for _, step in fine.values())),
+        f"  header: {flow(main.table.header)}",
+        *(f"  {line}" for line in _layout(main)),
+        *_steps(groups, min(step for _, step in linked)),
         *runs,
     ]
     if start := main.start_from_name:
         lines.append(f"  start_from_name: {flow(start)}  # guessed: the files or sheets are named by date")
-    for k, (key, (group, how)) in enumerate(joined.items()):
-        lines += ["  joined:"] * (k == 0) + [f"    {key}:  # guessed: {how.why}"]
-        lines += [f"      {name}: {flow(value)}" for name, value in how.keys.items()]
-        lines += ["      header: false"] * (not group.table.header)
-        lines += [f"      {name}: {flow(value)}" for name, value in _stated(group.table.form).items()]
-        lines.append(f"      time: {_time(group.clock)}")
+    for k, group in enumerate(joined):
+        assert group.joint is not None
+        keys = {**group.joint.keys, **({} if group.table.header else {"header": False})}
+        lines += ["  joined:"] * (k == 0) + [f"    {group.key}:  # guessed: {group.joint.why}"]
+        lines += [f"      {line}" for line in (*(f"{n}: {flow(v)}" for n, v in keys.items()), *_layout(group))]
     lines += ["channels:", *channels]
-    if ignored := dict(left for g in groups.values() for left in _left(g)):
+    if ignored := dict(left for g in groups for left in _left(g)):
         lines.append(f"ignore: {flow([*ignored])}  # guessed: {'; '.join(ignored.values())}")
     return "\n".join(lines) + "\n"
 
 
-def _stated(form: Form) -> dict[str, object]:
-    """Keys of the layout that reading does not find by itself."""
-    return form.model_dump(exclude={"time", "header"}, exclude_none=True)
-
-
-def _time(clock: Clock) -> str:
-    return f"{clock.line}  # {'' if clock.why.startswith('fill in') else 'guessed: '}{clock.why}"
+def _layout(group: Group) -> list[str]:
+    """Keys of the layout that reading does not find by itself, and the clock."""
+    stated = group.table.form.model_dump(exclude={"time", "header"}, exclude_none=True)
+    guessed = "" if group.clock.why.startswith("fill in") else "guessed: "
+    return [*(f"{n}: {flow(v)}" for n, v in stated.items()), f"time: {group.clock.line}  # {guessed}{group.clock.why}"]
 
 
 def _left(group: Group) -> list[tuple[str, str]]:
@@ -209,7 +211,8 @@ def _runs(group: Group) -> list[str]:
     if not group.clock.note:  # no gap of summer time
         ways.append({"pause": f"{guess.grid_step_s(max(2 * gap_s, _PAUSE_S)):g} s"})
     for n in sorted(group.named("temperature"), key=lambda n: seen[n][0] - seen[n][1])[:1]:
-        factor, offset = conversion(group.written_unit(group.names[n]) or "degC", "degC", n)
+        unit = group.unit(group.names[n])
+        factor, offset = conversion(unit.value if unit else "degC", "degC", n)
         idle = factor * (seen[n][0] + _IDLE_SHARE * (seen[n][1] - seen[n][0])) + offset
         ways.append({"driver": n, "above": float(f"{idle:.3g}")})
     ways += [{"every": "24 h"}]
@@ -238,25 +241,21 @@ def _linked(group: Group) -> tuple[dict[str, Guess], float]:
     return linked, guess.sweep_step_s(time_s, sweeps, [len(g.places) for g in group.position_groups])
 
 
-def _channels(group: Group, linked: dict[str, Guess], source: str, taken: list[str]) -> list[str]:
+def _channels(group: Group, linked: dict[str, Guess], taken: list[str]) -> list[str]:
     """Lines of a group's channels; their names join `taken`."""
     lines: list[str] = []
-    table = group.table
-    given = {f"{n}_{source}" if n in taken else n: n for n in group.names}
+    given = {f"{n}_{group.key}" if n in taken else n: n for n in group.names}
     name_of = {n: name for name, n in given.items()}
     of_group = {i for g in group.position_groups for i in g.places}
+    source = {} if group.key == "file" else {"source": group.key}
     for name, key in given.items():
         i = group.names[key]
         if i in of_group:
             continue
-        header = table.columns[i] if table.header else ""
-        where = "given in the units row or the cells" if stated_unit(table.units[i]) else "named so in the header"
-        column = _Column(
-            header, group.written_unit(i), where, group.roles[key], f"column: {flow(table.key(i))}", source
-        )
-        along = linked.get(key)
-        along = along and Guess(name_of[along.value], along.why)
-        lines += _channel(name, column, group.column(key), along)
+        values, role = group.column(key), group.roles[key]
+        along = Guess(name_of[linked[key].value], linked[key].why) if key in linked else None
+        unit = group.unit(i) or guess.unit(role.value, group.table.title(i), values)
+        lines += _channel(name, role, unit, {"column": flow(group.table.key(i)), **source}, values, along)
         taken.append(name)
     key_of = {i: name for name, i in group.names.items()}
     for positions in group.position_groups:
@@ -265,67 +264,44 @@ def _channels(group: Group, linked: dict[str, Guess], source: str, taken: list[s
     return lines
 
 
-@dataclass(frozen=True)
-class _Column:
-    """What is known of a column before its values are looked at closely; `key` is how the file finds it, as YAML."""
-
-    header: str
-    written: str | None
-    where: str  # the unit is written
-    role: Guess
-    key: str
-    source: str
-
-
-def _axis(group: PositionGroup, values: NDArray[np.float64], taken: Sequence[str], source: str) -> list[str]:
+def _axis(group: PositionGroup, values: NDArray[np.float64], taken: Sequence[str], source: dict[str, str]) -> list[str]:
     """Lines of the position channel and the error channel of columns that differ by a position."""
-    words = re.sub(r"[^a-z]+", "_", group.pattern.partition("*")[0].lower()).strip("_")
-    stem = group.letter or words or "axis"
+    before = group.pattern.partition("*")[0]
+    stem = group.letter or re.sub(r"[^a-z]+", "_", before.lower()).strip("_") or "axis"
     position, error = f"{stem}_position", f"{stem}_axis" if stem != "axis" else "axis_error"
     if {position, error} & set(taken):
         position, error = f"{position}_2", f"{error}_2"
-    why = Guess("error", f"{len(group.places)} columns whose names differ by a number")
-    column = _Column(group.pattern.partition("*")[0], None, "", why, f"columns: {flow(group.pattern)}", source)
-    lines = _channel(error, column, values, Guess(position, "the number in the names is taken for the position"))
+    role = Guess("error", f"{len(group.places)} columns whose names differ by a number")
+    along = Guess(position, "the number in the names is taken for the position")
+    unit = guess.unit("error", before, values)
     return [
         f"  {position}:",
         "    role: position  # guessed: from the names of the columns",
         "    unit: mm  # guessed: usual for positions",
         "    guessed: [role, unit]",
-        *lines,
+        *_channel(error, role, unit, {"columns": flow(group.pattern), **source}, values, along),
     ]
 
 
-def _channel(name: str, column: _Column, values: NDArray[np.float64], along: Guess | None) -> list[str]:
-    """Lines of one channel; range and resolution show in all `values`."""
-    role, written = column.role, column.written
-    unit = Guess(written, column.where) if written else guess.unit(role.value, column.header, values)
+def _channel(
+    name: str, role: Guess, unit: Guess, place: dict[str, str], values: NDArray[np.float64], along: Guess | None
+) -> list[str]:
+    """Lines of one channel; `place` is how the file finds it, range and resolution show in all `values`."""
     kept = {"temperature": "degC", "ambient": "degC", "error": "um"}.get(role.value, unit.value)
-    convertible = quantity(kept) == quantity(unit.value)
-    kept = kept if convertible else unit.value
-    lines = [f"  {flow(name)}:", f"    role: {role.value}  # guessed: {role.why}"]
-    lines.append(
-        f"    unit: {flow(kept)}" + (f"  # guessed: {unit.why}" if kept == unit.value else "  # what the lake keeps")
-    )
-    if column.key != f"column: {flow(name)}":
-        lines.append(f"    {column.key}")
-    if column.source != "file":
-        lines.append(f"    source: {column.source}")
-    guessed = ["role", "unit"]
+    kept = kept if quantity(kept) == quantity(unit.value) else unit.value
+    rows = [("role", role.value, f"guessed: {role.why}")]  # key, its YAML, and why where it is guessed
+    rows.append(("unit", flow(kept), f"guessed: {unit.why}" if kept == unit.value else "what the lake keeps"))
+    rows += [(key, value, "") for key, value in place.items() if f"{key}: {value}" != f"column: {flow(name)}"]
     if along is not None:
-        lines.append(f"    position: {flow(along.value)}  # guessed: {along.why}")
-        guessed.append("position")
+        rows.append(("position", flow(along.value), f"guessed: {along.why}"))
     factor, offset = 1.0, 0.0
     if kept != unit.value:
-        lines.append(f"    unit_in_file: {flow(unit.value)}  # guessed: {unit.why}")
-        guessed.append("unit_in_file")
+        rows.append(("unit_in_file", flow(unit.value), f"guessed: {unit.why}"))
         factor, offset = conversion(unit.value, kept, name)
-    step = guess.resolution(values)
-    if step is not None:
-        lines.append(f"    resolution: {step * abs(factor):.6g}  # guessed: smallest step seen")
-        guessed.append("resolution")
+    if (step := guess.resolution(values)) is not None:
+        rows.append(("resolution", f"{step * abs(factor):.6g}", "guessed: smallest step seen"))
     low, high = (v * factor + offset for v in guess.seen_range(values))
     if span := guess.plausible_range(role.value, low, high):
-        lines.append(f"    range: {flow([float(v) for v in span])}  # guessed: seen {low:.4g} to {high:.4g}, widened")
-        guessed.append("range")
-    return [*lines, f"    guessed: {flow(guessed)}"]
+        rows.append(("range", flow([float(v) for v in span]), f"guessed: seen {low:.4g} to {high:.4g}, widened"))
+    lines = [f"    {key}: {value}{f'  # {why}' * bool(why)}" for key, value, why in rows]
+    return [f"  {flow(name)}:", *lines, f"    guessed: {flow([key for key, _, why in rows if why])}"]

@@ -45,11 +45,25 @@ class Clock:
     note: str = ""
 
 
+@dataclass(frozen=True)
+class Joint:
+    """How files of another group belong to the recordings: keys of `recording.joined`, why, `recording.files`."""
+
+    keys: Mapping[str, str]
+    why: str
+    files: str | None = None
+
+
 @dataclass
 class Group:
-    """Tables with the same columns: files, or sheets of workbooks. `notes`: what the user must check."""
+    """Tables with the same columns: files, or sheets of workbooks. `notes`: what the user must check.
+
+    `key` is the name in the machine file; `joint` tells how the group belongs to the recordings.
+    """
 
     tables: list[tuple[Path, Table]]
+    key: str = "file"
+    joint: Joint | None = None
     notes: list[str] = field(default_factory=list)
     row_step_s: float | None = None  # of rows without a clock that are those of the recordings
 
@@ -126,11 +140,13 @@ class Group:
         places = [i for i in self.names.values() if quantity(table.units[i] or "um") in (None, "length")]
         return guess.position_groups(table.columns, places) if table.header else []
 
-    def written_unit(self, i: int) -> str | None:
+    def unit(self, i: int) -> Guess | None:
         """The unit of a column as its units row, its cells or its header gives it, known or not."""
-        header = self.table.columns[i] if self.table.header else ""
-        in_row = self.table.units[i]
-        return stated_unit(in_row) or guess.channel_unit_in_name(header) or guess.unknown_unit_in_name(header)
+        if stated := stated_unit(self.table.units[i]):
+            return Guess(stated, "given in the units row or the cells")
+        header = self.table.title(i)
+        named = guess.channel_unit_in_name(header) or guess.unknown_unit_in_name(header)
+        return Guess(named, "named so in the header") if named else None
 
     @cached_property
     def roles(self) -> dict[str, Guess]:
@@ -138,8 +154,8 @@ class Group:
 
         Where none is an error, the one that can be by its unit is; `notes` say so, or how to name one.
         """
-        headers = {n: self.table.columns[i] if self.table.header else "" for n, i in self.names.items()}
-        units = {n: self.written_unit(i) for n, i in self.names.items()}
+        headers = {n: self.table.title(i) for n, i in self.names.items()}
+        units = {n: unit.value if (unit := self.unit(i)) else None for n, i in self.names.items()}
         roles = {n: guess.role(headers[n], units[n], self.longest.columns[n]) for n in self.names}
         open_ = [n for n, r in roles.items() if r.value != "error" and guess.may_be_error(headers[n], units[n])]
         if any(r.value == "error" for r in roles.values()):
@@ -176,7 +192,6 @@ class Group:
                 f"{{step: {FILL_IN!r}}}", "fill in: no column is a clock; the time between two rows, such as 60 s", 1.0,
                 f"{note} the time between two rows as recording.time.step, such as 60 s",
             )  # fmt: skip
-        header = table.columns[table.time] if table.header else ""
         column = flow(table.key(table.time))
         if table.clock.elapsed:
             return Clock(f"{{column: {column}, clock: elapsed}}", "durations from 0, or beyond a day", 1.0)
@@ -187,7 +202,7 @@ class Group:
             others = f" (or {', '.join(table.stamps[1:])})" if len(table.stamps) > 1 else ""
             note = f"time stamps can be {' or '.join(table.stamps)}: day and month" if others else self._summer_time()
             return Clock(f"{{column: {column}, unit: timestamp{form}}}", f"its cells look like it{others}", 1.0, note)
-        unit, unit_s, note = self._time_unit(header)
+        unit, unit_s, note = self._time_unit(table.title(table.time))
         return Clock(f"{{column: {column}, unit: {unit.value}}}", unit.why, unit_s, note)
 
     def _summer_time(self) -> str:
@@ -284,15 +299,6 @@ def grouped(files: Sequence[Path], form: Form | None = None) -> tuple[list[Group
     if len(groups) == 1:
         return [*groups.values()], left_out
     return sorted(groups.values(), key=lambda g: (-len(g.tables), -len(g.named("temperature")))), left_out
-
-
-@dataclass(frozen=True)
-class Joint:
-    """How files of another group belong to the recordings: keys of `recording.joined`, why, `recording.files`."""
-
-    keys: Mapping[str, str]
-    why: str
-    files: str | None = None
 
 
 def joint(main: Group, other: Group) -> Joint | None:

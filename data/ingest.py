@@ -58,11 +58,11 @@ class Ingested:
     file: str
     batch_id: str
     status: str
-    version: int | None
-    rows_in: int | None
-    rows_stored: int
-    rows_dropped: int | None
-    findings: int
+    version: int | None = None
+    rows_in: int | None = None
+    rows_stored: int = 0
+    rows_dropped: int | None = None
+    findings: int = 0
     reason: str = ""
     stored_as: str = ""
     found: tuple[Finding, ...] = ()
@@ -104,7 +104,7 @@ class IngestReport:
 
     def as_frame(self) -> pd.DataFrame:
         """One row per batch or file without one, ignored files last; columns `COLUMNS`."""
-        ignored = [Ingested(str(f), "", "ignored", None, None, 0, None, 0, reason) for f, reason in self.ignored]
+        ignored = [Ingested(str(f), "", "ignored", reason=reason) for f, reason in self.ignored]
         frame = pd.DataFrame([asdict(r) for r in (*self.rows, *ignored)], columns=list(COLUMNS))
         return frame.astype({"version": "Int64", "rows_in": "Int64", "rows_dropped": "Int64"})
 
@@ -172,7 +172,7 @@ class _Run:
 
     def wait_for(self, file: Path) -> None:
         reason = f"{file}: still being written; ingest it again when it is complete"
-        self.report.rows.append(Ingested(str(file), "", "waiting", None, None, 0, None, 0, reason))
+        self.report.rows.append(Ingested(str(file), "", "waiting", reason=reason))
 
     def take(self, file: Path, folder: str = "") -> None:
         """One file: every batch that can be used goes in, the first problem ends the file.

@@ -67,15 +67,10 @@ class Quarantined:
     copy: Path | None
 
 
-def log_text(entries: list[Quarantined]) -> str:
-    """One JSON line per entry."""
-    rows: list[dict[str, Any]] = [{**asdict(e), "copy": e.copy.name if e.copy else None} for e in entries]
-    return "".join(json.dumps(row) + "\n" for row in rows)
-
-
-def entry_for(path: Path, machine: str, reason: str, folder: Path, name: str) -> Quarantined:
+def _log_entry(path: Path, machine: str, reason: str, folder: Path) -> Quarantined:
     """The log entry for `path`, with the hash of its bytes; writes nothing. A large file gets no copy."""
     sha256, copy = "", None
+    name = safe_name(path.name.encode("utf-8", "backslashreplace").decode())  # undecodable bytes escaped
     try:
         with path.open("rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
@@ -86,11 +81,6 @@ def entry_for(path: Path, machine: str, reason: str, folder: Path, name: str) ->
     except OSError as error:
         reason = f"{reason} (no copy kept: its bytes cannot be read, {error.strerror})"
     return Quarantined(machine, path.name, str(path), sha256, reason, _now(), copy)
-
-
-def ascii_if_broken(name: str) -> str:
-    """A file name with undecodable bytes escaped."""
-    return name.encode("utf-8", "backslashreplace").decode()
 
 
 class Lake:
@@ -201,13 +191,7 @@ class Lake:
         if not reason.strip():
             raise InputError("withdraw: the reason is empty; state why the batches are not to be used")
 
-        def edit(batches: Batches) -> tuple[list[str], set[str]]:
-            where = f"lake {self.name}: {machine} has no batch in use that fits"
-            ids = listing.chosen(list(listing.active(batches)), batch_ids, where)
-            listing.withdraw(batches, ids, reason.strip(), _now())
-            return ids, set(ids)
-
-        return self._change(machine, edit, known=True)
+        return self._edit(machine, batch_ids, "in use", lambda b, ids: listing.withdraw(b, ids, reason.strip(), _now()))
 
     def forget_machine(self, machine: str, reason: str) -> list[str]:
         """Withdraw every batch of a machine; see `withdraw`."""
@@ -222,13 +206,7 @@ class Lake:
             InputError: an unknown machine, or no withdrawn batch fits one of `batch_ids`.
             WorkError: see `put`.
         """
-
-        def edit(batches: Batches) -> tuple[list[str], set[str]]:
-            ids = self._withdrawn(batches, machine, batch_ids)
-            listing.restore(batches, ids)
-            return ids, set(ids)
-
-        return self._change(machine, edit, known=True)
+        return self._edit(machine, batch_ids, "withdrawn", listing.restore)
 
     def purge(self, machine: str, batch_ids: Sequence[str], quarantined: bool = False) -> list[str]:
         """Delete the content of withdrawn batches for good; reason, source and digest stay, and keep them out.
@@ -242,13 +220,7 @@ class Lake:
             InputError: an unknown machine, or no withdrawn batch fits one of `batch_ids`.
             WorkError: see `put`.
         """
-
-        def edit(batches: Batches) -> tuple[list[str], set[str]]:
-            ids = self._withdrawn(batches, machine, batch_ids)
-            listing.purge(batches, ids, _now())
-            return ids, set(ids)
-
-        ids = self._change(machine, edit, known=True)
+        ids = self._edit(machine, batch_ids, "withdrawn", lambda b, ids: listing.purge(b, ids, _now()))
         if quarantined:
             with self._writing():
                 folder = _quarantine(machine)
@@ -339,7 +311,7 @@ class Lake:
         with self._writing():
             held, found = set(self._store.files(folder)), list[Quarantined]()
             for path, reason in refused:
-                entry = entry_for(path, machine, reason, at, safe_name(ascii_if_broken(path.name)))
+                entry = _log_entry(path, machine, reason, at)
                 if entry.copy is not None and entry.copy.name not in held:
                     self._store.write(f"{folder}/{entry.copy.name}", path, private=True)
                     held.add(entry.copy.name)
@@ -350,7 +322,9 @@ class Lake:
                 entries = self._entries_of(raw, folder)
                 known = {replace(e, at="") for e in entries}
                 entries += [e for e in dict.fromkeys(found) if replace(e, at="") not in known]
-                if self._store.swap(f"{folder}/{LOG}", log_text(entries).encode(), stamp, private=True):
+                rows = [{**asdict(e), "copy": e.copy.name if e.copy else None} for e in entries]
+                log = "".join(json.dumps(row) + "\n" for row in rows)
+                if self._store.swap(f"{folder}/{LOG}", log.encode(), stamp, private=True):
                     break
                 again()
         return kept
@@ -475,10 +449,19 @@ class Lake:
             return None
         return sha256 if sha256 == noted else None
 
-    def _withdrawn(self, batches: Batches, machine: str, batch_ids: Sequence[str]) -> list[str]:
-        """The ids with withdrawn versions among those wanted."""
-        gone = [i for i, entries in batches.items() if any("withdrawn" in e for e in entries)]
-        return listing.chosen(gone, batch_ids, f"lake {self.name}: {machine} has no withdrawn batch that fits")
+    def _edit(
+        self, machine: str, wanted: Sequence[str], state: str, change: Callable[[Batches, list[str]], None]
+    ) -> list[str]:
+        """Change the batches among those wanted that are "in use", or have "withdrawn" versions; their ids."""
+
+        def edit(batches: Batches) -> tuple[list[str], set[str]]:
+            gone = [i for i, entries in batches.items() if any("withdrawn" in e for e in entries)]
+            found = ([*listing.active(batches)], "batch in use") if state == "in use" else (gone, "withdrawn batch")
+            ids = listing.chosen(found[0], wanted, f"lake {self.name}: {machine} has no {found[1]} that fits")
+            change(batches, ids)
+            return ids, set(ids)
+
+        return self._change(machine, edit, known=True)
 
     def _change(self, machine: str, edit: Callable[[Batches], tuple[R, set[str]]], known: bool = False) -> R:
         """Change a machine's batches and commit that, then let the current files of the changed batches follow.

@@ -79,6 +79,10 @@ class Table:
         """The strptime patterns that fit, if the clock is of time stamps."""
         return self.clock.stamps
 
+    def title(self, i: int) -> str:
+        """The header of a column, "" without any."""
+        return self.columns[i] if self.header else ""
+
     def key(self, i: int) -> str | int:
         """How a machine file names a column: its header, or its place where that is empty or not the only one."""
         name = normalise(self.columns[i])
@@ -98,7 +102,7 @@ def look(path: Path, form: Form | None = None) -> list[Table]:
     with sheets_of(path, (), form) as sheets:
         for sheet in sheets:
             try:
-                tables.append(look_at(sheet, path.name, form))
+                tables.append(_look_at(sheet, path.name, form))
             except InputError as error:
                 problems.append(error)
         pivot = _pivot(sheets[0], tables[0]) if len(sheets) == len(tables) == 1 and form.pivot is None else None
@@ -110,9 +114,7 @@ def look(path: Path, form: Form | None = None) -> list[Table]:
     return tables
 
 
-def look_at(sheet: Sheet, where: str, form: Form | None = None) -> Table:
-    """Structure of one sheet. Raises InputError as `look`."""
-    form = form or Form()
+def _look_at(sheet: Sheet, where: str, form: Form) -> Table:
     first = _first_row(sheet, where, form)
     width = len(sheet.head[first])
     header, units = _headers(sheet, first, width, form)

@@ -161,7 +161,10 @@ class Recordings:
             path.write_bytes(body)
             for machine in self._machines:
                 try:
-                    list(read_batches(path, machine))
+                    for batch in read_batches(path, machine):
+                        counts = batch.repairs
+                        assert counts["rows_in"] == counts["rows_used"] + counts["rows_dropped"]
+                        assert batch.n_rows == counts["rows_out"] >= 2
                 except InputError as error:
                     _one_line(error)
 

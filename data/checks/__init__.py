@@ -40,7 +40,7 @@ CHECKS = Registry(
         "unexplained": "data.checks.across_batches:Unexplained",
         "short": "data.checks.timeline:Short",
         "truncated": "data.checks.timeline:Truncated",
-        "copied": "data.checks.copies:Copied",
+        "copied": "data.checks.across_batches:Copied",
     },
 )
 USER = "user"  # the check's name in findings that the machine file's overrule adds

@@ -1,15 +1,18 @@
-"""Checks that compare batches: offset sensors, swapped sensors, errors that the temperatures do not explain."""
+"""Checks that compare batches: offset and swapped sensors, errors that no temperature explains, shared rows."""
 
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data.batch import Batch, Finding
-from data.checks.base import THERMAL, Array, Check, in_time, row_medians, smallest_step
+from data.checks.base import THERMAL, Array, Check, in_time, row_medians, smallest_step, span_text
 from data.checks.expected import unexplained
+from data.lakefile import MEASURED
 from data.machine import Machine
 
 _BATCHES = 5
@@ -231,3 +234,66 @@ class _Sums:
 
 def _sound(batch: Batch, name: str) -> bool:
     return name in batch.channels and bool(np.isfinite(batch.masked(name)).mean() > 0.8)
+
+
+_HASHED_ROWS = 16  # rows that are compared as one; noise does not repeat over so many
+_HASHED_CHANGES = 8  # of them that differ from the row before: an idle machine may well rest at the same values twice
+_MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio, odd (Knuth, 1973, multiplicative hashing)
+
+
+class Copied(Check):
+    """Stretches of equal measured values in two batches, which a left-out batch has then been trained on: a recording
+    that ends earlier or goes on longer than its copy, both of which ingest stores.
+
+    Batches are compared by hashes of `_HASHED_ROWS` consecutive rows in all measured channels that every batch has. The
+    earlier batch in the given order counts as the original. Rows are compared as they are on the grid: a copy that was
+    cut, rounded or exported at another rate so that its rows on the grid are others is not found.
+    """
+
+    key = "copied"
+    summary = "rows with the same measured values as in another batch"
+
+    def across(self, batches: Sequence[Batch], machine: Machine) -> dict[int, list[Finding]]:
+        shared = sorted(set.intersection(*map(_measured, batches))) if batches else []
+        hashes = [_hashes(b, shared) for b in batches] if shared else []
+        rows = [np.flatnonzero(h) for h in hashes]
+        every = np.concatenate([h[r] for h, r in zip(hashes, rows, strict=True)]) if rows else np.empty(0, np.uint64)
+        batch_of = np.repeat(np.arange(len(rows)), [len(r) for r in rows])
+        _, first, group = np.unique(every, return_index=True, return_inverse=True)
+        origin = batch_of[first][group]
+        found = {}
+        for k in np.unique(batch_of[origin != batch_of]).tolist():
+            mine = batch_of == k
+            copied = rows[k][origin[mine] != k]
+            other = batches[Counter(origin[mine][origin[mine] != k].tolist()).most_common(1)[0][0]]
+            n = len(np.unique(copied[:, None] + np.arange(_HASHED_ROWS)))
+            batch, last = batches[k], int(copied[-1]) + _HASHED_ROWS - 1
+            shorter = min(batch, other, key=lambda b: b.n_rows)
+            message = (
+                f"{n} of {batch.n_rows} rows, {span_text(batch, int(copied[0]), last)}, have the same measured values "
+                f"as batch {other.batch_id}: a copy, or a longer export of the same run; withdraw the shorter one "
+                f"(`thermodrift lake withdraw {batch.machine} {shorter.batch_id} --reason TEXT`)"
+            )
+            found[k] = [self.in_rows(batch, None, int(copied[0]), last, message, masks=False)]
+        return found
+
+
+def _measured(batch: Batch) -> set[str]:
+    """Measured channels with a value."""
+    return {n for n in batch.names(*MEASURED) if n in batch.table and np.isfinite(batch.values(n)).any()}
+
+
+def _hashes(batch: Batch, names: Sequence[str]) -> NDArray[np.uint64]:
+    """The hash of each row and the `_HASHED_ROWS` - 1 behind it, (n - _HASHED_ROWS + 1,); 0 where few change."""
+    if batch.n_rows < _HASHED_ROWS:
+        return np.zeros(0, np.uint64)
+    row = np.zeros(batch.n_rows, np.uint64)
+    for name in names:
+        values = batch.values(name)
+        bits = np.where(np.isnan(values), np.nan, values + 0.0).view(np.uint64)  # one NaN, and no -0.0
+        row = (row ^ bits ^ (bits >> np.uint64(32))) * _MULTIPLIER
+    out = np.zeros(batch.n_rows - _HASHED_ROWS + 1, np.uint64)
+    for k in range(_HASHED_ROWS):
+        out = (out ^ row[k : k + len(out)]) * _MULTIPLIER
+    changes = np.concatenate([[0], np.cumsum(row[1:] != row[:-1])])
+    return np.where(changes[_HASHED_ROWS - 1 :] - changes[: len(out)] >= _HASHED_CHANGES, out, np.uint64(0))

@@ -110,11 +110,11 @@ def signals(batch: Batch) -> Signals:
     return kept
 
 
-def excess(values: Array, half: int = 4) -> Array:
+def excess(values: Array) -> Array:
     """Step into each row less the median step of the rows around it, shape (n,); row 0 is 0, NaN next to holes."""
     steps = np.diff(values, prepend=values[:1])
     steps[:1] = 0.0
-    return steps - rolling_median(steps, half)
+    return steps - rolling_median(steps, half=4)
 
 
 def rolling_median(values: Array, half: int, least: int = 1) -> Array:
@@ -175,6 +175,12 @@ class Check:
         masks: bool = True,
     ) -> Finding:
         return Finding(self.key, channel, message, start_s, end_s, masks)
+
+    def in_rows(
+        self, batch: Batch, channel: str | None, first: int, last: int, message: str, masks: bool = True
+    ) -> Finding:
+        """A finding from the time of row `first` to that of row `last`."""
+        return self.finding(channel, message, float(batch.time_s[first]), float(batch.time_s[last]), masks)
 
 
 def overrule_line(channel: str, check: str, batch_id: str = "") -> str:

@@ -71,13 +71,13 @@ def predicted(x: Array, y: Array, out: Bools, resolution: float | None, ridge: f
 
 
 class Expected:
-    """The regression of one channel's steps in a run; `common` False leaves out the step of the other temperatures."""
+    """The regression of one channel's steps in a run."""
 
-    def __init__(self, batch: Batch, name: str, common: bool = True) -> None:
+    def __init__(self, batch: Batch, name: str) -> None:
         values = signals(batch).values(name)
         self._steps = np.diff(values, prepend=np.nan)
         self._known = np.isfinite(self._steps)
-        self._x = np.column_stack([*_surroundings(batch, name, common), *driven(batch)])
+        self._x = np.column_stack([*_surroundings(batch, name), *driven(batch)])
         self._resolution = batch.channels[name].resolution
 
     def contradicts(self, row: int, least: float) -> bool:
@@ -151,7 +151,7 @@ def movement(
     return float(np.ptp(fit.values[out])), float(np.std((y - fit.values)[~out]))
 
 
-def _surroundings(batch: Batch, name: str, common: bool) -> list[Array]:
+def _surroundings(batch: Batch, name: str) -> list[Array]:
     """Levels of this and the other channels in the row before, and what the temperatures' steps have in common."""
     seen = signals(batch)
     thermal = [n for n in in_time(batch, *THERMAL) if n != name]
@@ -160,7 +160,7 @@ def _surroundings(batch: Batch, name: str, common: bool) -> list[Array]:
         return columns
     levels = np.column_stack([_held(seen.values(n)) for n in thermal])
     columns += [_before(level, 1) for level in _components(levels).T]
-    if common and len(thermal) > 2:
+    if len(thermal) > 2:
         steps = np.diff(levels, axis=0, prepend=levels[:1])
         scale = np.maximum(1.4826 * np.median(np.abs(steps), axis=0), steps.std(axis=0)) + 1e-9
         step = np.median(steps / scale, axis=1)

@@ -12,6 +12,7 @@ from data.checks.base import (
     EQUAL,
     THERMAL,
     Array,
+    Bools,
     Check,
     constant_runs,
     in_time,
@@ -136,7 +137,7 @@ class Frozen(Check):
                     message = (
                         f"{name} stays at {v[a]:.5g} {batch.channels[name].unit} {span_text(batch, a, b)}: {reason}"
                     )
-                    found.append(self.finding(name, message, float(batch.time_s[a + 1]), float(batch.time_s[b])))
+                    found.append(self.in_rows(batch, name, a + 1, b, message))
         return found
 
     def _no_flicker(self, batch: Batch, name: str, v: Array, a: int, b: int, longest_other: int) -> str:
@@ -266,18 +267,11 @@ class ErrorHeld(Check):
                     f"{name} repeats {batch.values(name)[a]:.1f} {unit} {span_text(batch, a, last)} {state}, while the "
                     f"temperatures let expect a change of {moved:.1f} {unit}"
                 )
-                found.append(self.finding(name, message, float(batch.time_s[a + 1]), float(batch.time_s[last])))
+                found.append(self.in_rows(batch, name, a + 1, last, message))
         return found
 
     def _is_held(
-        self,
-        batch: Batch,
-        names: list[str],
-        code: Array,
-        a: int,
-        b: int,
-        runs: list[tuple[int, int]],
-        still: np.ndarray,
+        self, batch: Batch, names: list[str], code: Array, a: int, b: int, runs: list[tuple[int, int]], still: Bools
     ) -> bool:
         n = b - a
         if n * batch.step_s < _HELD_SECONDS:

@@ -69,7 +69,7 @@ class Spike(Check):
                     f"{name} reads {v[r]:.5g} {channel.unit} at {clock(batch.time_s[r])}, {off[r]:.1f} {unit} off the "
                     "samples around it"
                 )
-                found.append(self.finding(name, message, float(batch.time_s[r]), float(batch.time_s[r])))
+                found.append(self.in_rows(batch, name, r, r, message))
         return found
 
     @staticmethod

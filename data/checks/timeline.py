@@ -114,7 +114,7 @@ class Gap(Check):
         minutes = (b - a + 1) * batch.step_s / 60.0
         who = f"{name} has no values" if name else "no channel has values"
         message = f"{who} {span_text(batch, a, b)} ({minutes:.3g} min)"
-        return self.finding(name, message, float(batch.time_s[a]), float(batch.time_s[b]), masks=False)
+        return self.in_rows(batch, name, a, b, message, masks=False)
 
 
 _SHARE = 0.6

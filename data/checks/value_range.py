@@ -40,15 +40,11 @@ class OutOfRange(Check):
                 out = (v < channel.low - rounded) | (v > channel.high + rounded)
             for a, b in stretches(out):
                 worst = v[a : b + 1][np.argmax(np.abs(v[a : b + 1] - 0.5 * (channel.low + channel.high)))]
-                found.append(
-                    self.finding(
-                        name,
-                        f"{name} reads {worst:.5g} {channel.unit} {span_text(batch, a, b)}, outside "
-                        f"{channel.low:g} to {channel.high:g}",
-                        float(batch.time_s[a]),
-                        float(batch.time_s[b]),
-                    )
+                message = (
+                    f"{name} reads {worst:.5g} {channel.unit} {span_text(batch, a, b)}, outside "
+                    f"{channel.low:g} to {channel.high:g}"
                 )
+                found.append(self.in_rows(batch, name, a, b, message))
         return found
 
 
@@ -90,18 +86,12 @@ class Saturated(Check):
                 if rail is None or (channel.role != "error" and abs(rail) < 100.0):
                     continue
                 arrived = _jump(v, a)
-                if arrived <= 0.05 * abs(rail):
-                    continue
-                if arrived > step_limit(seen.excess(name), channel.resolution):
-                    found.append(
-                        self.finding(
-                            name,
-                            f"{name} jumps by {arrived:.1f} {channel.unit} at {clock(batch.time_s[a])} to its "
-                            f"full scale {rail:g} {channel.unit} and stays there {span_text(batch, a, b)}",
-                            float(batch.time_s[a]),
-                            float(batch.time_s[b]),
-                        )
+                if arrived > 0.05 * abs(rail) and arrived > step_limit(seen.excess(name), channel.resolution):
+                    message = (
+                        f"{name} jumps by {arrived:.1f} {channel.unit} at {clock(batch.time_s[a])} to its "
+                        f"full scale {rail:g} {channel.unit} and stays there {span_text(batch, a, b)}"
                     )
+                    found.append(self.in_rows(batch, name, a, b, message))
         return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +12,9 @@ import pytest
 
 from data.batch import Batch, Finding
 from data.checks import CHECKS, check_batch, check_machine, checked, usable_channels, why_missing
+from data.checks.across_batches import Copied
 from data.errors import InputError
-from data.machine import Machine, Overrule
+from data.machine import Machine, Overrule, parse_machine
 from thermodrift.testing import ContractCheck, check_check
 from thermodrift.testing.recordings import AIR, STEP_S, STOP_S, THERMAL, toy_batch, toy_machine
 
@@ -59,11 +61,8 @@ SEEDS = range(6)
 
 @pytest.mark.parametrize("step_s", [pytest.param(60.0, marks=pytest.mark.slow), 300.0])
 def test_clean_batches_raise_nothing(step_s: float) -> None:
-    machine = toy_machine()
-    batches = [toy_batch(seed, step_s) for seed in range(30)]
-    batches = [b.with_findings(check_batch(b, machine)) for b in batches]
-    told = [f.message for b in check_machine(batches, machine) for f in b.findings]
-    assert told == []
+    known = on_the_machine([toy_batch(seed, step_s) for seed in range(30)])
+    assert [f.message for b in known for f in b.findings] == []
 
 
 @pytest.mark.parametrize("check", [c for key in CHECKS for c in check_check(key, generate_only=True)], ids=str)
@@ -91,63 +90,49 @@ def test_a_jump_of_a_sensor_is_masked_to_the_end(seed: int) -> None:
     assert np.isnan(masked[row:]).all() and np.isfinite(masked[: row - 1]).all()
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_loose_contact_is_masked_until_it_comes_back(seed: int) -> None:
-    row = 10 + 8 * seed
-    bad = added(toy_batch(seed), "bed", row, row + 6, 12.0)
-    found = the_one(bad, "jump_no_return", "bed")
-    assert row_of(bad, found) == row and found.end_s == (row + 5) * STEP_S
-    assert "comes back at" in found.message
+def held(batch: Batch, name: str, first: int, last: int | None, value: float | None = None) -> Batch:
+    """The channel at one value, by default that of the first row."""
+    v = batch.values(name).copy()
+    v[first:last] = v[first] if value is None else value
+    return changed(batch, name, v)
+
+
+FAULTS = [  # channel, first row, rows later with each seed, rows of the fault, its size, check, words
+    ("bed", 10, 8, 6, 12.0, "jump_no_return", "comes back at"),  # a loose contact
+    ("x", 20, 5, None, 40.0, "jump_no_return", "does not return"),  # a knocked probe
+    ("column", 12, 8, 1, 8.0, "spike", "off the samples around it"),
+    ("room", 12, 8, 1, -10.0, "spike", "off the samples around it"),
+    ("z", 12, 8, 1, 40.0, "spike", "off the samples around it"),
+    ("rear", 10, 9, 5, 850.0, "out_of_range", "outside -20 to 90"),
+]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_knocked_probe_is_found_but_not_a_speed_shift(seed: int) -> None:
-    row = 20 + 5 * seed
-    bad = added(toy_batch(seed), "x", row, None, 40.0)
-    assert abs(row_of(bad, the_one(bad, "jump_no_return", "x")) - row) <= 1
-    shifted = added(toy_batch(seed), "x", round(STOP_S / STEP_S), None, 12.0)
-    assert findings(shifted) == ()
+@pytest.mark.parametrize(("name", "first", "later", "rows", "size", "check", "words"), FAULTS)
+def test_a_fault_is_found_where_it_is(
+    seed: int, name: str, first: int, later: int, rows: int | None, size: float, check: str, words: str
+) -> None:
+    row = first + later * seed
+    bad = added(toy_batch(seed), name, row, None if rows is None else row + rows, size)
+    found = the_one(bad, check, name)
+    assert abs(row_of(bad, found) - row) <= (rows is None) and words in found.message
+    assert found.end_s == (None if rows is None else (row + rows - 1) * STEP_S)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize(("name", "size"), [("column", 8.0), ("room", -10.0), ("z", 40.0)])
-def test_a_spike_is_masked_alone(seed: int, name: str, size: float) -> None:
-    row = 12 + 8 * seed
-    bad = added(toy_batch(seed), name, row, row + 1, size)
-    found = the_one(bad, "spike", name)
-    assert found.start_s == found.end_s == row * STEP_S
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_samples_out_of_range(seed: int) -> None:
-    row = 10 + 9 * seed
-    bad = added(toy_batch(seed), "rear", row, row + 5, 850.0)
-    found = the_one(bad, "out_of_range", "rear")
-    assert (found.start_s, found.end_s) == (row * STEP_S, (row + 4) * STEP_S)
-    assert "outside -20 to 90" in found.message
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_probe_at_its_full_scale(seed: int) -> None:
-    row = 20 + 7 * seed
-    batch = toy_batch(seed)
-    v = batch.values("x").copy()
-    v[row:] = 99.9998
-    found = the_one(changed(batch, "x", v), "saturated", "x")
+def test_values_that_stand_still(seed: int) -> None:
+    row, batch = 20 + 7 * seed, toy_batch(seed)
+    found = the_one(held(batch, "x", row, None, 99.9998), "saturated", "x")
     assert found.start_s == row * STEP_S and "full scale 100 um" in found.message
+    assert the_one(held(batch, "z", 30, 50), "frozen", "z").start_s == 31 * STEP_S
+    row, v = round(STOP_S / STEP_S) + 2, batch.values("front")  # while the machine cools
+    if abs(v[-1] - v[row]) > 4.0:
+        assert abs(row_of(batch, the_one(held(batch, "front", row, None), "frozen", "front")) - row) <= 2
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_frozen_channels(seed: int) -> None:
-    batch = toy_batch(seed)
-    v = batch.values("z").copy()
-    v[30:50] = v[30]
-    assert the_one(changed(batch, "z", v), "frozen", "z").start_s == 31 * STEP_S
-    t = batch.values("front").copy()
-    row = round(STOP_S / STEP_S) + 2
-    t[row:] = t[row]  # while the machine cools
-    if abs(batch.values("front")[-1] - t[row]) > 4.0:
-        assert abs(row_of(batch, the_one(changed(batch, "front", t), "frozen", "front")) - row) <= 2
+def test_a_speed_shift_is_no_fault(seed: int) -> None:
+    assert findings(added(toy_batch(seed), "x", round(STOP_S / STEP_S), None, 12.0)) == ()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -221,10 +206,8 @@ def year() -> list[Batch]:
 
 def test_a_sensor_that_reads_30_K_more_from_some_day_on() -> None:
     batches = [added(b, "head", 0, None, 30.0) if k >= 8 else b for k, b in enumerate(year())]
-    machine = toy_machine()
-    known = check_machine([b.with_findings(check_batch(b, machine)) for b in batches], machine)
-    told = [(k, f.check, f.channel) for k, b in enumerate(known) for f in b.findings]
-    assert told == [(k, "offset", "head") for k in range(8, 12)]
+    known = on_the_machine(batches)
+    assert told(known) == [(k, "offset", "head", True) for k in range(8, 12)]
     assert np.isnan(known[8].masked("head")).all()
     usable, excluded = usable_channels(known, (*THERMAL, "room"))
     assert usable == ("front", "rear", "column", "bed", "room")
@@ -235,32 +218,43 @@ def test_a_sensor_that_reads_30_K_more_from_some_day_on() -> None:
     )  # fmt: skip
 
 
-def test_two_sensors_that_changed_places() -> None:
-    batches = year()
-    front, column = batches[7].values("front"), batches[7].values("column")
-    batches[7] = changed(changed(batches[7], "front", column), "column", front)
-    known = check_machine(batches, toy_machine())
-    told = [(k, f.check, f.channel) for k, b in enumerate(known) for f in b.findings if f.masks]
-    assert told == [(7, "swapped", "front"), (7, "swapped", "column")]
+def told(batches: list[Batch]) -> list[tuple[int, str, str | None, bool]]:
+    return [(k, f.check, f.channel, f.masks) for k, b in enumerate(batches) for f in b.findings]
 
 
-def test_an_air_sensor_is_dead_by_its_own_history() -> None:
-    batches = year()
-    still = batches[4].values("rear")[0] + 0.1 * np.random.default_rng(0).integers(0, 2, batches[4].n_rows)
-    batches[4] = changed(batches[4], "rear", np.round(still, 1))
-    known = check_machine(batches, toy_machine())
-    assert ("dead", "rear") in [(f.check, f.channel) for f in known[4].findings]
-    assert not any(f.masks for k, b in enumerate(known) for f in b.findings if k != 4)
+def still_rear(b: Batch) -> Batch:
+    values = b.values("rear")[0] + 0.1 * np.random.default_rng(0).integers(0, 2, b.n_rows)
+    return changed(b, "rear", np.round(values, 1))
 
 
-def test_a_drifting_probe_is_odd_but_not_masked() -> None:
-    batches = year()
-    drift = np.linspace(0, 150.0, batches[5].n_rows)
-    batches[5] = changed(batches[5], "x", np.round(batches[5].values("x") + drift))
-    known = check_machine(batches, toy_machine())
-    told = [(k, f.check, f.channel, f.masks) for k, b in enumerate(known) for f in b.findings]
-    assert told == [(5, "unexplained", "x", False)]
-    assert np.isfinite(known[5].masked("x")).all()
+def swapped(b: Batch) -> Batch:
+    return changed(changed(b, "front", b.values("column")), "column", b.values("front"))
+
+
+ODD: dict[str, tuple[int, Callable[[Batch], Batch], list[tuple[str, str | None, bool]], str]] = {
+    "two sensors that changed places": (7, swapped, [("swapped", n, True) for n in ("front", "column")], "behaves as"),
+    "a sensor dead by its own history": (4, still_rear, [("dead", "rear", True)], "rear moves by"),
+    "a probe that drifts, not masked": (
+        5, lambda b: changed(b, "x", np.round(b.values("x") + np.linspace(0, 150.0, b.n_rows))),
+        [("unexplained", "x", False)], "a ridge model of the other batches",
+    ),
+    "a part that starts warm and cools": (
+        4, lambda b: changed(b, "bed", np.round(b.values("bed") + 25.0 * np.exp(-b.time_s / 6000.0), 1)),
+        [("offset", "bed", False), ("unexplained", "z", False)], "the part was warm or cold",
+    ),
+    "a run much shorter than the others": (
+        6, lambda b: replace(b, table=b.table.iloc[:25].reset_index(drop=True)),
+        [("short", None, False)], "lasts 2 h 00 min, the median run 8 h 00 min",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", ODD)
+def test_one_run_that_is_unlike_the_others(what: str) -> None:
+    odd, change, expected, words = ODD[what]
+    known = on_the_machine([change(b) if k == odd else b for k, b in enumerate(year())])
+    assert told(known) == [(odd, *found) for found in expected]
+    assert words in known[odd].findings[0].message
 
 
 def heated(batch: Batch, name: str, first: int, level: float) -> Batch:
@@ -310,8 +304,7 @@ def test_a_faulty_sensor_or_unit_in_every_run_stays_a_fault() -> None:
     fahrenheit = [at(b, 22.0) for b in year()]
     fahrenheit = [replace(b, table=b.table.assign(**{n: 1.8 * b.table[n] + 32 for n in AIR})) for b in fahrenheit]
     assert masks_of(on_the_machine(fahrenheit)) == {("wrong_unit", n) for n in AIR}
-    held = [changed(b, "z", np.where(b.time_s > 2e4, b.values("z")[67], b.values("z"))) for b in year()]
-    assert masks_of(on_the_machine(held)) == {("frozen", "z")}
+    assert masks_of(on_the_machine([held(b, "z", 67, None) for b in year()])) == {("frozen", "z")}
 
 
 def test_a_bed_that_starts_where_degF_would_put_a_cold_one_is_hot() -> None:
@@ -344,23 +337,6 @@ def test_a_permanent_offset_stays_a_fault_where_other_masks_interrupt_it() -> No
     assert masks_of(on_the_machine(batches)) == {("offset", "head"), ("out_of_range", "head")}
 
 
-def test_a_part_that_starts_warm_and_cools_has_no_offset() -> None:
-    batches = year()
-    warm = batches[4].values("bed") + 25.0 * np.exp(-batches[4].time_s / 6000.0)
-    known = on_the_machine([*batches[:4], changed(batches[4], "bed", np.round(warm, 1)), *batches[5:]])
-    assert masks_of(known) == set()
-    assert "the part was warm or cold" in known[4].findings[0].message
-
-
-def test_a_run_much_shorter_than_the_others_is_noted() -> None:
-    batches = year()
-    batches[6] = replace(batches[6], table=batches[6].table.iloc[:25].reset_index(drop=True))
-    known = on_the_machine(batches)
-    told = [(k, f.check, f.masks) for k, b in enumerate(known) for f in b.findings]
-    assert told == [(6, "short", False)]
-    assert "lasts 2 h 00 min, the median run 8 h 00 min" in known[6].findings[0].message
-
-
 @pytest.mark.parametrize(("start", "words"), [("2199-03-01", "in the future"), ("1980-01-01", "before any logger")])
 def test_a_date_that_cannot_be_is_noted(start: str, words: str) -> None:
     (found,) = findings(replace(toy_batch(0), start=pd.Timestamp(start)))
@@ -383,9 +359,7 @@ def test_the_machine_file_overrules() -> None:
         Overrule(batch="b01", channel="x", mask=True, start_s=600.0, end_s=1200.0, reason="probe touched"),
     ]
     machine = toy_machine(overrule=rules)
-    bad = added(toy_batch(0), "bed", 30, None, 15.0)
-    batches = [b.with_findings(check_batch(b, machine)) for b in (bad, toy_batch(1))]
-    once = check_machine(batches, machine)
+    once = on_the_machine([added(toy_batch(0), "bed", 30, None, 15.0), toy_batch(1)], machine)
     assert [f.overruled for f in once[0].findings] == ["sensor was moved on purpose"]
     assert np.isfinite(once[0].masked("bed")).all()
     assert np.flatnonzero(np.isnan(once[1].masked("x"))).tolist() == [2, 3, 4]
@@ -395,8 +369,7 @@ def test_the_machine_file_overrules() -> None:
 
 def test_an_overrule_outside_its_time_leaves_the_mask() -> None:
     machine = toy_machine(overrule=[Overrule(channel="bed", end_s=600.0, reason="early only")])
-    bad = added(toy_batch(0), "bed", 30, None, 15.0)
-    known = check_machine([bad.with_findings(check_batch(bad, machine))], machine)
+    known = on_the_machine([added(toy_batch(0), "bed", 30, None, 15.0)], machine)
     assert np.isnan(known[0].masked("bed")[30:]).all()
 
 
@@ -405,3 +378,40 @@ def test_a_missing_channel_is_no_input() -> None:
     lacking = changed(batch, "bed", np.full(batch.n_rows, np.nan))
     usable, excluded = usable_channels([batch, replace(lacking, batch_id="b77")], ("bed", "rear"))
     assert usable == ("rear",) and excluded == (("bed", "bed has no value in 100% of b77 (not recorded)"),)
+
+
+ONE_SENSOR = parse_machine("{machine: toy, channels: {t0: {role: temperature, unit: degC}}}", "test")
+
+
+def part(batch: Batch, rows: slice, batch_id: str) -> Batch:
+    table = batch.table.iloc[rows].reset_index(drop=True)
+    table["time_s"] -= table["time_s"].iloc[0]
+    return replace(batch, batch_id=batch_id, table=table, start=pd.Timestamp("2026-01-01"))
+
+
+@pytest.mark.parametrize(("rows", "n"), [(slice(7, None), 53), (slice(0, 30), 30), (slice(0, 60), 60)])
+def test_a_part_of_another_batch_is_found(rows: slice, n: int, toy_batches: Callable[..., list[Batch]]) -> None:
+    batches = toy_batches()
+    found = Copied().across([*batches, part(batches[2], rows, "copy")], ONE_SENSOR)
+    (finding,) = found.pop(len(batches))
+    assert not found and not finding.masks and finding.channel is None
+    assert finding.message.startswith(f"{n} of {n} rows, from 0 min to ") and "as batch b02:" in finding.message
+    assert "`thermodrift lake withdraw toy copy --reason TEXT`" in finding.message
+
+
+def test_a_run_that_is_exported_with_the_next_one(toy_batches: Callable[..., list[Batch]]) -> None:
+    a, b, *others = toy_batches()
+    both = replace(a, batch_id="both", table=pd.concat([a.table, b.table.assign(time_s=b.time_s + 18000)]))
+    (finding,) = Copied().across([*others, b, both], ONE_SENSOR)[len(others) + 1]
+    assert (finding.start_s, finding.end_s) == (18000.0, float(18000 + b.time_s[-1]))
+
+
+def test_machines_at_rest_and_small_differences_are_no_copies(toy_batches: Callable[..., list[Batch]]) -> None:
+    batches = toy_batches()
+    at_rest = [replace(b, table=b.table.assign(**dict.fromkeys(b.channels, 20.0))) for b in batches[:2]]
+    noisy = replace(batches[2], table=batches[2].table + 1e-9 * np.arange(60)[:, None])
+    assert Copied().across([*batches, *at_rest, noisy], ONE_SENSOR) == {}
+    assert (
+        Copied().across([], ONE_SENSOR) == {}
+        and Copied().across([part(batches[0], slice(0, 9), "a")], ONE_SENSOR) == {}
+    )

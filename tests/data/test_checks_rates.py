@@ -11,19 +11,12 @@ import pytest
 from data.batch import Batch, Finding
 from data.checks import check_batch
 from data.machine import parse_machine
+from thermodrift.testing import recordings
+from thermodrift.testing.recordings import AIR, GAIN_K, TAU_S, THERMAL
 
-THERMAL = ("front", "rear", "head", "column", "bed")
 MACHINE = parse_machine(
-    "machine: toy\nrecording: {step_s: 0.1, max_gap_s: 900}\nchannels:\n"
-    + "".join(
-        f"  {n}: {{role: temperature, unit: degC, resolution: 0.01, range: [-20, 90]}}\n" for n in (*THERMAL, "room")
-    )
-    + "  spindle_rpm: {role: driver, unit: rpm, resolution: 1}\n"
-    + "".join(f"  {n}: {{role: error, unit: um, resolution: 1, range: [-500, 500]}}\n" for n in "xz"),
-    "toy",
+    recordings.MACHINE.replace("step_s: 300", "step_s: 0.1").replace("resolution: 0.1", "resolution: 0.01"), "toy"
 )
-TAU_S = np.array([1200.0, 1800.0, 3600.0, 10000.0, 28000.0])
-RISE_K = np.array([20.0, 14.0, 10.0, 6.0, 2.0])
 STOP_S, END_S, FAULT_S = 6000.0, 8000.0, 3000.0
 RATES_S = [0.1, 1.0, 60.0]
 
@@ -33,7 +26,7 @@ def recorded(step_s: float, noise_K: float = 0.02) -> Batch:
     rng = np.random.default_rng(0)
     time_s = np.arange(0.0, END_S, 0.1)
     on, off = np.minimum(time_s, STOP_S)[:, None], np.maximum(time_s - STOP_S, 0.0)[:, None]
-    rise = RISE_K * (1.0 - np.exp(-on / TAU_S)) * np.exp(-off / TAU_S)
+    rise = GAIN_K * (1.0 - np.exp(-on / TAU_S)) * np.exp(-off / TAU_S)
     table = pd.DataFrame({"time_s": time_s})
     for j, name in enumerate(THERMAL):
         table[name] = np.round(20.0 + rise[:, j] + rng.normal(0.0, noise_K, len(time_s)), 2)
@@ -72,7 +65,7 @@ def test_a_jump_is_found_though_the_logger_smooths_it(name: str, size: float, sp
 
 @pytest.mark.parametrize("spread_s", [0.0, 5.0])
 def test_an_interruption_is_found_though_interpolation_spreads_it(spread_s: float) -> None:
-    together = {name: 3.0 + 0.4 * k for k, name in enumerate((*THERMAL, "room"))}
+    together = {name: 3.0 + 0.4 * k for k, name in enumerate(AIR)}
     found = findings(stepped(recorded(0.1), together, spread_s))
     assert {(f.check, f.channel) for f in found} == {("interruption", "x"), ("interruption", "z")}
     assert all(FAULT_S - 20.0 <= (f.start_s or 0.0) <= FAULT_S for f in found)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from types import SimpleNamespace
+from pathlib import Path
 
 import numpy as np
 import openpyxl
@@ -13,9 +13,10 @@ import pytest
 from data import guess
 from data.describe import draft_machine_file, notes
 from data.errors import InputError
-from data.machine import parse_machine
-from data.peek import look_at
+from data.machine import Machine, parse_machine
+from data.peek import look
 from data.recording import read_batches, recording_files
+from plants.sample.sample_axis import write_sample_axis
 
 
 def run(seed: int, n: int = 400) -> pd.DataFrame:
@@ -41,6 +42,13 @@ def run(seed: int, n: int = 400) -> pd.DataFrame:
 def draft(files):
     text = draft_machine_file(files)
     return text, parse_machine(text, "draft")
+
+
+def draft_of(folder, table):
+    """The draft of one table, and what it reads of it."""
+    table.to_csv(folder / "a.csv", index=False)
+    text, machine = draft([folder / "a.csv"])
+    return text, machine, next(read_batches(folder / "a.csv", machine))
 
 
 @pytest.mark.parametrize("suffix", ["csv", pytest.param("xlsx", marks=pytest.mark.slow), "parquet"])
@@ -79,8 +87,7 @@ def test_draft_reads_the_files_it_was_drafted_from(tmp_path, suffix):
 
 
 def test_every_guess_is_marked_on_its_line_and_in_the_list(tmp_path):
-    run(1).to_csv(tmp_path / "a.csv", index=False)
-    text, machine = draft([tmp_path / "a.csv"])
+    text, machine, _ = draft_of(tmp_path, run(1))
     for name, part in machine.channels.items():
         block = re.search(rf'\n  "?{re.escape(name)}"?:\n((?:    .*\n)+)', text)[1]
         marked = set(re.findall(r"^    (\w+):.*# guessed: \S", block, re.M))
@@ -173,11 +180,9 @@ def warm_up(clock: str, step: float = 1.0, n: int = 300, **more) -> pd.DataFrame
 )  # fmt: skip
 def test_the_unit_of_time_is_read_from_the_header(tmp_path, clock, unit):
     per_minute = {"s": 60, "min": 1, "h": 1 / 60, "ms": 60_000, "d": 1 / 1440}[unit]
-    warm_up(clock, per_minute).to_csv(tmp_path / "a.csv", index=False)
-    text, machine = draft([tmp_path / "a.csv"])
+    text, machine, batch = draft_of(tmp_path, warm_up(clock, per_minute))
     assert (machine.recording.time.column, machine.recording.time.unit) == (clock, unit)
     assert machine.recording.step_s == 60 and "# check" not in text
-    (batch,) = read_batches(tmp_path / "a.csv", machine)
     assert batch.time_s[-1] == pytest.approx(299 * 60)
 
 
@@ -195,8 +200,7 @@ def test_the_unit_of_time_is_read_from_the_header(tmp_path, clock, unit):
     ],
 )
 def test_an_unknown_or_implausible_unit_of_time_is_pointed_out(tmp_path, clock, step, unit, words):
-    warm_up(clock, step).to_csv(tmp_path / "a.csv", index=False)
-    text, machine = draft([tmp_path / "a.csv"])
+    text, machine, _ = draft_of(tmp_path, warm_up(clock, step))
     assert machine.recording.time.unit == unit
     (said,) = notes(text)
     assert said.startswith(words)
@@ -219,23 +223,14 @@ def test_without_a_clock_the_draft_asks_for_the_step(tmp_path, counter):
     assert batch.time_s.tolist() == [60.0 * i for i in range(300)]
 
 
-def test_columns_that_are_no_clock():
+def test_columns_that_are_no_clock(tmp_path):
     rng = np.random.default_rng(5)
     warm = 20 + 12 * (1 - np.exp(-np.arange(400) / 60))
     for header, values in (("T9", 20 + np.arange(400) * 1e-4), ("Weg", np.arange(400.0)), ("a", warm),
                            ("a", np.cumsum(rng.exponential(1, 400)))):  # fmt: skip
-        body = [[v, 1.0] for v in values.tolist()]
-        sheet = SimpleNamespace(
-            head=[[header, "b"], *body],
-            decimal=".",
-            summary="",
-            name="",
-            units=(),
-            origin_s=0.0,
-            step_s=None,
-            first_row=None,
-        )
-        assert look_at(sheet, "test").time is None
+        pd.DataFrame({header: values, "b": 1.0}).to_csv(tmp_path / "a.csv", index=False)
+        (table,) = look(tmp_path / "a.csv")
+        assert table.time is None
 
 
 @pytest.mark.parametrize(
@@ -281,11 +276,8 @@ def test_dates_and_times_of_day_in_two_columns(tmp_path, suffix, start):
 
 
 def test_serial_numbers_of_a_workbook_are_time_stamps(tmp_path):
-    warm_up("Time").assign(Time=44352.25 + np.arange(300) / 1440).to_csv(tmp_path / "a.csv", index=False)
-    _, machine = draft([tmp_path / "a.csv"])
-    (batch,) = read_batches(tmp_path / "a.csv", machine)
-    warm_up("Ora").assign(Ora=1.7e9 + 60.0 * np.arange(300)).to_csv(tmp_path / "b.csv", index=False)
-    _, of_unix = draft([tmp_path / "b.csv"])
+    _, machine, batch = draft_of(tmp_path, warm_up("Time").assign(Time=44352.25 + np.arange(300) / 1440))
+    _, of_unix, _ = draft_of(tmp_path, warm_up("Ora").assign(Ora=1.7e9 + 60.0 * np.arange(300)))
     assert of_unix.recording.time.unit == "timestamp" and of_unix.recording.step_s == 60
     assert batch.start.round("s") == pd.Timestamp("2021-06-05 06:00") and machine.recording.step_s == 60
 
@@ -304,8 +296,7 @@ def test_codes_for_no_value_are_no_readings(tmp_path):
     table = warm_up("Minutes")
     table.loc[50:54, "Spindle temp"] = -999
     table.loc[7, "dz [um]"] = 3.4e38
-    table.to_csv(tmp_path / "a.csv", index=False)
-    text, machine = draft([tmp_path / "a.csv"])
+    text, machine, _ = draft_of(tmp_path, table)
     assert notes(text) == [
         "column 'Spindle temp': -999 (5×) is taken for a missing value",
         "column 'dz [um]': 3.4e+38 (1×) is taken for a missing value",
@@ -326,3 +317,96 @@ def test_codes_for_no_value_are_no_readings(tmp_path):
 )  # fmt: skip
 def test_units_in_headers(header, unit):
     assert guess.channel_unit_in_name(header) == unit
+
+
+# errors along an axis
+
+AT_MM = np.linspace(0, 330, 12)
+SWEEPS_MIN = np.arange(0, 241, 30)
+
+
+def error_um(time_min):
+    return (3 + 0.02 * AT_MM) * (1 - np.exp(-np.atleast_1d(time_min)[:, None] / 60))
+
+
+def nut(time_min):
+    return 20 + 5 * (1 - np.exp(-np.asarray(time_min, float) / 60))
+
+
+def sweeps_of(path: Path, machine: Machine, error: str) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and errors that the drafted file reads, one row a sweep."""
+    (batch,) = read_batches(path, machine)
+    there = np.isfinite(batch.values(error))
+    at = batch.values(machine.channels[error].position)[there]
+    return at.reshape(-1, 12), batch.values(error)[there].reshape(-1, 12)
+
+
+def test_rows_that_share_a_stamp_are_a_sweep(tmp_path: Path) -> None:
+    t = np.repeat(SWEEPS_MIN, 12)
+    table = {
+        "time [min]": t,
+        "P [mm]": np.tile(AT_MM, 9),
+        "deviation [um]": error_um(SWEEPS_MIN).ravel(),
+        "T nut": nut(t),
+    }
+    text, machine, _ = draft_of(tmp_path, pd.DataFrame(table))
+    assert "position: P_mm  # guessed: rows share a time stamp while the position changes" in text
+    assert "guessed: [role, unit, position, range]" in text
+    assert (machine.recording.step_s, machine.recording.max_gap_s) == (10, 9000)  # 12 rows in two minutes
+    at, error = sweeps_of(tmp_path / "a.csv", machine, "deviation_um")
+    assert np.allclose(at, AT_MM) and np.allclose(error, error_um(SWEEPS_MIN))
+
+
+def test_readings_with_stamps_of_their_own_in_a_log(tmp_path: Path) -> None:
+    (path,) = write_sample_axis(tmp_path, 0, 1)
+    table = pd.read_csv(path, skiprows=1)
+    table = table.rename(columns={"x_axis": "x_error", "z_axis": "z_error", "x_spindle": "dx", "z_spindle": "dz"})
+    text, machine, _ = draft_of(tmp_path, table)
+    assert machine.channels["x_error"].position == "x_position" and machine.channels["z_error"].position == "z_position"
+    assert machine.channels["dx"].position is None
+    assert "position: x_position  # guessed: error and position stand in the same rows" in text
+    assert machine.recording.step_s == 10
+    at, _ = sweeps_of(tmp_path / "a.csv", machine, "z_error")
+    assert (at == at[0]).all()
+
+
+@pytest.mark.parametrize("pattern", ["x={:g}", "X = {:.1f} mm", "Ex @{:g}", "z {:g}", "dev at {:g}mm"])
+def test_a_column_for_each_position(tmp_path: Path, pattern: str) -> None:
+    table = {"time [min]": SWEEPS_MIN, "T1": nut(SWEEPS_MIN), "T2": 20.0 + SWEEPS_MIN / 100, "T3": 21.0}
+    table |= {pattern.format(p): e for p, e in zip(AT_MM, error_um(SWEEPS_MIN).T, strict=True)}
+    text, machine, _ = draft_of(tmp_path, pd.DataFrame(table))
+    (error,) = machine.names("error")
+    assert machine.names("position") == (machine.channels[error].position,)
+    assert "role: error  # guessed: 12 columns whose names differ by a number" in text
+    assert {"T1", "T2", "T3"} <= set(machine.channels)
+    at, got = sweeps_of(tmp_path / "a.csv", machine, error)
+    assert np.allclose(at, AT_MM)
+    assert np.allclose(got, error_um(SWEEPS_MIN))
+    assert machine.recording.step_s == 10
+
+
+def test_two_axes_in_columns_are_two_channels() -> None:
+    columns = ["time", *(f"x={p}" for p in (0, 60, 90)), *(f"z={p}" for p in (-500, -200, 20)), "T=20"]
+    found = guess.position_groups(columns, range(1, len(columns)))
+    assert guess.position_groups(["0", "60", "90"], range(3))[0].pattern == "*"
+    assert [(g.pattern, g.letter, g.position_mm) for g in found] == [
+        ("x=*", "x", (0.0, 60.0, 90.0)),
+        ("z=*", "z", (-500.0, -200.0, 20.0)),
+    ]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [["T1", "T2", "T3"], ["PT01", "PT02", "PT04"], ["1", "2", "3", "4"], ["x1", "x2", "x3"], ["x=1", "x=2"],
+     ["ch10", "ch20", "ch30"]],
+)  # fmt: skip
+def test_numbered_channels_are_no_positions(names: list[str]) -> None:
+    assert guess.position_groups(names, range(len(names))) == []
+
+
+def test_an_axis_that_moves_beside_a_steady_record_is_no_sweep(tmp_path: Path) -> None:
+    t = np.arange(0, 240.0)
+    table = {"time [min]": t, "P [mm]": np.resize(AT_MM, 240), "dz [um]": 10 * (1 - np.exp(-t / 60)), "T nut": nut(t)}
+    _, machine, _ = draft_of(tmp_path, pd.DataFrame(table))
+    assert machine.channels["P_mm"].role == "position" and machine.channels["dz_um"].position is None
+    assert machine.recording.step_s == 60

@@ -48,6 +48,13 @@ def lake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lake:
     return Lake(tmp_path / "lake")
 
 
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Of the recordings."""
+    (tmp_path / "in").mkdir()
+    return tmp_path / "in"
+
+
 def write(path: Path, *lines: str) -> Path:
     path.write_text("\n".join(["header", *lines, ""]))
     return path
@@ -92,9 +99,7 @@ def test_findings_of_the_reader_stay_before_those_of_the_checks(
     assert [f.check for f in lake.load("vmc", "a").findings] == ["clock", "spike"]
 
 
-def test_a_directory_of_mixed_files(tmp_path: Path, lake: Lake) -> None:
-    folder = tmp_path / "in"
-    folder.mkdir()
+def test_a_directory_of_mixed_files(folder: Path, lake: Lake) -> None:
     good = write(folder / "good.csv", "good,1,3,0")
     write(folder / "bad.csv", "!", "never,1,3,0")
     notes = write(folder / "notes.md", "words")
@@ -178,10 +183,8 @@ def test_a_batch_that_the_lake_refuses_goes_to_quarantine(
     assert "column 'T1' is no channel of the batch" in report.quarantined[0].reason
 
 
-def test_through_the_real_readers_and_checks(tmp_path: Path) -> None:
+def test_through_the_real_readers_and_checks(tmp_path: Path, folder: Path) -> None:
     """Real CSV in, the same numbers out; every kind of unusable file beside it is named."""
-    folder = tmp_path / "in"
-    folder.mkdir()
     rng = np.random.default_rng(1)
     wanted = {}
     for name in ("run1", "run2"):
@@ -227,9 +230,7 @@ def statuses(report: IngestReport) -> list[tuple[str, str]]:
     return [(r.batch_id, r.status) for r in report.rows]
 
 
-def test_a_copy_under_another_name_is_left_out(tmp_path: Path, lake: Lake) -> None:
-    folder = tmp_path / "in"
-    folder.mkdir()
+def test_a_copy_under_another_name_is_left_out(folder: Path, lake: Lake) -> None:
     write(folder / "a copy.csv", "a copy,1,30,2")
     write(folder / "run.csv", "run,1,30,2", "more,2,30,2")
     report = ingest([folder], MACHINE, lake)
@@ -347,9 +348,10 @@ def test_the_lakes_own_files_can_be_ingested_again(tmp_path: Path) -> None:
     np.testing.assert_array_equal(batch.values("T1"), lake.load("vmc", "2025/run", 1).values("T1"))
 
 
-def test_a_file_that_was_cut_within_a_row_is_named_and_a_link_out_of_the_folder_is_not_followed(tmp_path: Path) -> None:
-    folder, lake = tmp_path / "in", Lake(tmp_path / "lake")
-    folder.mkdir()
+def test_a_file_that_was_cut_within_a_row_is_named_and_a_link_out_of_the_folder_is_not_followed(
+    tmp_path: Path, folder: Path
+) -> None:
+    lake = Lake(tmp_path / "lake")
     rows = [f"{60 * k},{20 + 0.1 * (k % 7):.1f},{k % 5:.1f}" for k in range(40)]
     whole = "\n".join(["t,T1,z_um", *rows])
     (folder / "run1.csv").write_text(whole[:-9])  # within the last time stamp
@@ -367,9 +369,7 @@ def test_a_file_that_was_cut_within_a_row_is_named_and_a_link_out_of_the_folder_
     ]
 
 
-def test_a_name_that_steers_a_terminal_is_not_taken(tmp_path: Path) -> None:
-    folder = tmp_path / "in"
-    folder.mkdir()
+def test_a_name_that_steers_a_terminal_is_not_taken(tmp_path: Path, folder: Path) -> None:
     for name in ("a\x1b[2J.csv", "b\nthermodrift: all is well.csv"):
         (folder / name).write_text("t,T1,z_um\n0,20,0\n60,21,1\n")
     report = ingest([folder], MACHINE, Lake(tmp_path / "lake"))

@@ -1,10 +1,7 @@
 """The lake against plain readers, plain copies of what was put, and random histories."""
 
-import os
-import subprocess
-import sys
+import io
 import tempfile
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,50 +17,15 @@ from data.batch import Batch, Channel, Finding
 from data.errors import InputError, WorkError
 from data.lake import Lake
 from data.lakefile import content_digest, encode, safe_name
+from tests.data.lakes import files, make, overwrite, same
 
 FINDING = Finding("frozen", "T1", "T1 stands at 20.0 degC for 3 h", 0.0, 60.0)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def quick_disk() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", lambda fd: None)
-        yield
-
-
-def make(
-    batch_id: str = "run1",
-    *,
-    seed: int = 0,
-    rows: int = 5,
-    start: str | None = "2026-03-01 08:00",
-    machine: str = "vmc",
-    **more: object,
-) -> Batch:
-    values = np.random.default_rng(seed).normal(20.0, 1.0, (rows, 2))
-    values[0, 1] = np.nan
-    table = pd.DataFrame({"time_s": np.arange(rows) * 60.0, "T1": values[:, 0], "z_um": values[:, 1]})
-    channels = {
-        "T1": Channel("T1", "temperature", "degC", 0.1, -10.0, 90.0),
-        "z_um": Channel("z_um", "error", "um"),
-        "rpm": Channel("rpm", "driver", "rpm"),
-    }
-    when = None if start is None else pd.Timestamp(start)
-    batch = Batch(machine, batch_id, table, channels, when, source=f"in/{batch_id}.csv", labels={"speed": 4000})
-    return replace(batch, **more)
-
-
-def same(a: Batch, b: Batch) -> None:
-    pd.testing.assert_frame_equal(a.table, b.table, check_exact=True)
-    for name in ("machine", "batch_id", "start", "simulated", "repairs", "findings", "labels"):
-        assert getattr(a, name) == getattr(b, name), name
-    assert list(a.channels.items()) == list(b.channels.items())
-
-
-def test_round_trip_keeps_everything(tmp_path: Path) -> None:
+def test_round_trip_keeps_everything(place: Path | str) -> None:
     batch = make(findings=(FINDING,), repairs={"duplicates": 2}, labels={"speed": 4000, "who": "Ä 冬"}, simulated=True)
-    stored = Lake(tmp_path / "lake").put(batch)
-    back = Lake(tmp_path / "lake").load("vmc", "run1")
+    stored = Lake(place).put(batch)
+    back = Lake(place).load("vmc", "run1")
     same(back, batch)
     assert (back.digest, back.version, back.source) == (stored.digest, 1, "in/run1.csv")
     assert content_digest(back) == stored.digest == content_digest(batch)
@@ -96,11 +58,11 @@ def test_same_content_is_stored_once(tmp_path: Path) -> None:
     lake = Lake(tmp_path)
     batch = make()
     first = lake.put(batch)
-    files = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()}
+    before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()}
     turned = replace(batch, table=batch.table[["z_um", "time_s", "T1"]], source="elsewhere/run1.csv")
     again = lake.put(turned)
     assert (first.status, again.status, again.version, again.digest) == ("new", "unchanged", 1, first.digest)
-    assert {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()} == files
+    assert {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()} == before
     assert lake.load("vmc", "run1").source == "in/run1.csv"
 
 
@@ -129,8 +91,8 @@ def changed(batch: Batch, what: str) -> Batch:
 @pytest.mark.parametrize(
     "what", ["a float", "a hole", "a row", "a name", "a unit", "the start", "a label", "simulated"]
 )
-def test_any_changed_content_is_a_new_version(tmp_path: Path, what: str) -> None:
-    lake = Lake(tmp_path)
+def test_any_changed_content_is_a_new_version(place: Path | str, what: str) -> None:
+    lake = Lake(place)
     old, new = make(), changed(make(), what)
     lake.put(old)
     stored = lake.put(new)
@@ -138,22 +100,22 @@ def test_any_changed_content_is_a_new_version(tmp_path: Path, what: str) -> None
     same(lake.load("vmc", "run1", version=1), old)
     assert lake.load("vmc", "run1").digest == stored.digest
     assert [v.current for v in lake.versions("vmc", "run1")] == [False, True]
-    assert len(list(tmp_path.glob("machine=vmc/year=*/*.parquet"))) == 1
+    assert sum(name.startswith("machine=vmc/year=") for name in files(lake)) == 1
 
 
-def test_new_findings_refresh_the_version_and_keep_the_old_ones(tmp_path: Path) -> None:
-    lake = Lake(tmp_path)
+def test_new_findings_refresh_the_version_and_keep_the_old_ones(place: Path | str) -> None:
+    lake = Lake(place)
     first = lake.put(make())
     second = lake.put(make(findings=(FINDING,)))
     assert (second.status, second.version, second.digest) == ("refreshed", 1, first.digest)
     assert lake.load("vmc", "run1").findings == (FINDING,)
     (version,) = lake.versions("vmc", "run1")
-    assert len(version.files) == 2 and all((tmp_path / f).exists() for f in version.files)
+    assert len(version.files) == 2 and {*version.files} <= {*files(lake)} and lake.size(version.files[0]) > 1000
     assert lake.put(make(findings=(FINDING,))).status == "unchanged"
 
 
-def test_a_source_that_changes_back_is_the_newest_version_again(tmp_path: Path) -> None:
-    lake = Lake(tmp_path)
+def test_a_source_that_changes_back_is_the_newest_version_again(place: Path | str) -> None:
+    lake = Lake(place)
     for seed in (1, 2, 1):
         lake.put(make(seed=seed))
     assert [v.version for v in lake.versions("vmc", "run1")] == [1, 2, 3]
@@ -161,8 +123,8 @@ def test_a_source_that_changes_back_is_the_newest_version_again(tmp_path: Path) 
     same(lake.load("vmc", "run1", 2), make(seed=2))
 
 
-def test_load_all_sorts_by_start_then_id(tmp_path: Path) -> None:
-    lake = Lake(tmp_path)
+def test_load_all_sorts_by_start_then_id(place: Path | str) -> None:
+    lake = Lake(place)
     lake.put_many([make("c", start="2026-01-02"), make("z", start=None), make("b", start="2025-07-01"), make("a")])
     lake.put(make("other", machine="lathe"))
     assert [b.batch_id for b in lake.load_all("vmc")] == ["b", "c", "a", "z"]
@@ -204,18 +166,19 @@ def test_without_hard_links_the_current_file_is_a_copy(tmp_path: Path, monkeypat
     np.testing.assert_array_equal(pd.read_parquet(tmp_path)["T1"], make(seed=2).values("T1"))
 
 
-def test_quarantine_keeps_bytes_and_reason_once(tmp_path: Path) -> None:
+def test_quarantine_keeps_bytes_and_reason_once(place: Path | str, tmp_path: Path) -> None:
     source = tmp_path / "run 7.csv"
     source.write_bytes(b"\x00junk")
-    lake = Lake(tmp_path / "lake")
+    lake = Lake(place)
     copy = lake.quarantine(source, "vmc", "run 7.csv: not text")
     assert lake.quarantine(source, "vmc", "run 7.csv: not text") == copy
-    assert copy.read_bytes() == source.read_bytes() and copy.name.endswith("-run 7.csv")
+    (kept,) = [body for name, body in files(lake).items() if name.endswith("-run 7.csv")]
+    assert kept == source.read_bytes() and copy.name.endswith("-run 7.csv")
     (entry,) = lake.quarantined("vmc")
     assert (entry.reason, entry.source, entry.copy) == ("run 7.csv: not text", str(source), copy)
     source.write_bytes(b"other junk")
     assert lake.quarantine(source, "vmc", "run 7.csv: not text") != copy
-    assert len(lake.quarantined("vmc")) == 2 and copy.exists() and source.exists()
+    assert len(lake.quarantined("vmc")) == 2 and sum("-run 7.csv" in name for name in files(lake)) == 2
 
 
 def test_quarantine_of_an_unreadable_file_keeps_the_reason(tmp_path: Path) -> None:
@@ -267,9 +230,7 @@ def test_a_batch_that_cannot_be_stored_leaves_the_lake_as_it_was(
 def test_damage_is_told_in_one_line(tmp_path: Path) -> None:
     lake = Lake(tmp_path)
     lake.put(make())
-    file = tmp_path / lake.versions("vmc", "run1")[0].files[0]
-    file.chmod(0o644)
-    file.write_bytes(b"PAR1")
+    overwrite(lake, lake.versions("vmc", "run1")[0].files[0], b"PAR1")
     with pytest.raises(WorkError, match=r"cannot be read .*; restore it from a backup") as told:
         lake.load("vmc", "run1")
     assert "\n" not in str(told.value)
@@ -278,52 +239,38 @@ def test_damage_is_told_in_one_line(tmp_path: Path) -> None:
         lake.machines()
 
 
-def stored_file(lake: Lake, batch_id: str = "run1") -> Path:
-    return lake.root / lake.versions("vmc", batch_id)[-1].files[-1]
-
-
-def overwrite(file: Path, body: bytes) -> None:
-    file.chmod(0o644)
-    file.write_bytes(body)
-
-
-def other_values(digest: str) -> bytes:
-    """A stored file as the lake writes it, with the note of another one: valid, with other values."""
-    return encode(make(seed=7), digest).to_pybytes()
-
-
 @pytest.mark.parametrize("damage", ["values", "cut", "a byte", "gone"])
-def test_a_file_changed_after_its_ingest_is_refused_and_healed(tmp_path: Path, damage: str) -> None:
-    lake = Lake(tmp_path)
+def test_a_file_changed_after_its_ingest_is_refused_and_healed(place: Path | str, damage: str) -> None:
+    lake = Lake(place)
     batch = make(findings=(FINDING,))
     digest = lake.put_many([batch, make("run2", seed=2)])[0].digest
-    file = stored_file(lake)
-    body = file.read_bytes()
-    changed = {"values": other_values(digest), "cut": body[:-40], "a byte": body[:9] + b"?" + body[10:]}
-    if damage == "gone":
-        file.unlink()
-    else:
-        overwrite(file, changed[damage])
+    file = lake.versions("vmc", "run1")[-1].files[-1]
+    body = files(lake)[file]
+    other_values = encode(make(seed=7), digest).to_pybytes()  # valid, with the note of the right ones
+    changed = {"values": other_values, "cut": body[:-40], "a byte": body[:9] + b"?" + body[10:], "gone": None}
+    overwrite(lake, file, changed[damage])
     for reading in (lambda: lake.load("vmc", "run1"), lambda: lake.load_all("vmc")):
-        with pytest.raises(WorkError, match=r"lake file .*: .*cannot be read .*ingest its source .*again") as told:
+        with pytest.raises(WorkError, match=r"(?s)lake file .*: .*cannot be read .*ingest its source .*again") as told:
             reading()
-        assert len(str(told.value).splitlines()) == 1 and str(file) in str(told.value)
-        assert "batch run1 of vmc" in str(told.value) and "in/run1.csv" in str(told.value)
+        in_folder = isinstance(place, Path)  # an object store's own reason may take several lines
+        assert len(str(told.value).splitlines()) == 1 or not in_folder
+        assert f"{lake.name}/{file}" in str(told.value) and "batch run1 of vmc" in str(told.value)
+        assert "in/run1.csv" in str(told.value)
     stored = lake.put(batch)
     assert stored.status == "healed"
     assert (stored.version, stored.digest) == (1, digest)
     same(lake.load("vmc", "run1"), batch)
-    (current,) = tmp_path.glob("machine=vmc/year=*/run1.parquet")
-    np.testing.assert_array_equal(pd.read_parquet(current)["T1"], batch.values("T1"))
+    current = pd.read_parquet(io.BytesIO(files(lake)["machine=vmc/year=2026/run1.parquet"]))
+    np.testing.assert_array_equal(current["T1"], batch.values("T1"))
     assert lake.put(batch).status == "unchanged"
     assert len(lake.load_all("vmc")) == 2
 
 
-def test_one_file_of_two_versions_is_healed_for_both(tmp_path: Path) -> None:
-    lake = Lake(tmp_path)
+def test_one_file_of_two_versions_is_healed_for_both(place: Path | str) -> None:
+    lake = Lake(place)
     for seed in (1, 2, 1):
         lake.put(make(seed=seed))
-    overwrite(stored_file(lake), b"PAR1")
+    overwrite(lake, lake.versions("vmc", "run1")[-1].files[-1], b"PAR1")
     assert lake.put(make(seed=1)).status == "healed"
     for version in (1, 3):
         same(lake.load("vmc", "run1", version), make(seed=1))
@@ -375,16 +322,6 @@ def test_any_history_is_kept(steps: list[tuple[str, str, int, str | None]]) -> N
                 assert [v.digest for v in listed] == [content_digest(b) for b in versions]
         kept = {(e.name, e.copy.read_text()) for e in lake.quarantined("vmc") if e.copy}
         assert kept == junk
-
-
-def test_hidden_folders_stay_out_of_a_cold_interpreter(tmp_path: Path) -> None:
-    """A reader that has never heard of the lake: one row per stored row, whatever versions lie there."""
-    lake = Lake(tmp_path)
-    for seed in range(3):
-        lake.put(make(seed=seed))
-    code = f"import pandas; print(len(pandas.read_parquet({str(tmp_path)!r})))"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.strip() == "5"
 
 
 def test_a_write_touches_the_manifest_of_its_machine_alone(tmp_path: Path) -> None:

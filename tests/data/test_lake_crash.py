@@ -2,29 +2,17 @@
 
 import os
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from data.batch import Batch, Channel
+from data.batch import Batch
 from data.lake import Lake
 from data.lakefile import content_digest
-
-CALLS = ("replace", "link", "unlink", "fsync", "open", "chmod", "mkdir")
-
-
-def make(batch_id: str, seed: int, start: str = "2026-03-01") -> Batch:
-    values = np.random.default_rng(seed).normal(20.0, 1.0, 5)
-    table = pd.DataFrame({"time_s": np.arange(5) * 60.0, "T1": values})
-    return Batch("vmc", batch_id, table, {"T1": Channel("T1", "temperature", "degC")}, pd.Timestamp(start))
-
+from tests.data.lakes import crash_everywhere, make, run
 
 OLD, NEW = make("a", 1, "2025-12-31"), make("a", 2, "2026-01-01")
 NEWCOMER = make("b", 3)
@@ -37,41 +25,8 @@ def scenario(root: Path) -> None:
     lake.quarantine(root.parent / "junk.csv", "vmc", "junk")
 
 
-def die_at(n: int) -> None:
-    """Kill this process at the n-th change to a folder: odd n before the system call, even n right after it."""
-    count = 0
-    os.fsync = lambda fd: None  # a kill does not ask the disk, only a power cut does
-
-    def dying(call: Callable[..., Any]) -> Callable[..., Any]:
-        def wrapped(*args: Any, **kwargs: Any) -> Any:
-            nonlocal count
-            count += 1
-            if count == n:
-                os.kill(os.getpid(), signal.SIGKILL)
-            result = call(*args, **kwargs)
-            count += 1
-            if count == n:
-                os.kill(os.getpid(), signal.SIGKILL)
-            return result
-
-        return wrapped
-
-    for name in CALLS:
-        setattr(os, name, dying(getattr(os, name)))
-
-
-def crash_everywhere(base: Path) -> None:
-    """Run in a process of its own: one forked child per point of death, until a child lives to the end."""
-    for n in range(1, 500):
-        root = base / f"{n:03d}"
-        Lake(root).put(OLD)
-        child = os.fork()
-        if child == 0:
-            die_at(n)
-            scenario(root)
-            os._exit(0)
-        if os.waitpid(child, 0)[1] == 0:
-            return
+def crash_scenario(base: Path) -> None:
+    crash_everywhere(base, lambda root: Lake(root).put(OLD), scenario)
 
 
 def store_forever(root: Path, ready: int) -> None:
@@ -94,11 +49,6 @@ def kill_at_random(base: Path) -> None:
         time.sleep(delay_s)
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
-
-
-@pytest.fixture(autouse=True)
-def quick_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "fsync", lambda fd: None)
 
 
 def check(root: Path) -> dict[str, list[Batch]]:
@@ -127,17 +77,11 @@ def shown_by_plain_readers(root: Path) -> dict[str, list[float]]:
     return {str(name): part["T1"].tolist() for name, part in frame.groupby("batch")}
 
 
-def run(function: str, module: str = "test_lake_crash") -> subprocess.Popen[bytes]:
-    """A function of a module of this folder in a process of its own."""
-    code = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import {module} as t; "
-    return subprocess.Popen([sys.executable, "-c", code + f"t.{function}"], cwd=Path(__file__).parents[2])
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_kill_at_any_step_leaves_the_old_or_the_new_state(tmp_path: Path) -> None:
     (tmp_path / "junk.csv").write_text("junk")
-    assert run(f"crash_everywhere(t.Path({str(tmp_path)!r}))").wait(300) == 0
+    assert run(f"crash_scenario(t.Path({str(tmp_path)!r}))", "test_lake_crash").wait(300) == 0
     roots = sorted(p for p in tmp_path.iterdir() if p.is_dir())
     assert len(roots) > 60
     seen = set()
@@ -163,7 +107,7 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new_state(tmp_path: Path) -> N
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_kills_at_random_moments_on_one_lake(tmp_path: Path) -> None:
-    assert run(f"kill_at_random(t.Path({str(tmp_path)!r}))").wait(300) == 0
+    assert run(f"kill_at_random(t.Path({str(tmp_path)!r}))", "test_lake_crash").wait(300) == 0
     found = check(tmp_path / "lake")
     assert len(found["a"]) > 25
     for name, seeds in (("a", 0), ("b", 1)):
@@ -186,7 +130,7 @@ def store_range(root: Path, who: str, go: Path) -> None:
 def test_two_writers_at_once_lose_nothing(tmp_path: Path) -> None:
     root, go = tmp_path / "lake", tmp_path / "go"
     call = "store_range(t.Path({!r}), {!r}, t.Path({!r}))"
-    writers = [run(call.format(str(root), who, str(go))) for who in ("x", "y")]
+    writers = [run(call.format(str(root), who, str(go)), "test_lake_crash") for who in ("x", "y")]
     go.touch()
     assert [w.wait(300) for w in writers] == [0, 0]
     lake = Lake(root)

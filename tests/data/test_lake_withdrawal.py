@@ -3,7 +3,6 @@
 import contextlib
 import json
 import os
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,26 +14,25 @@ from data.batch import Batch, Channel
 from data.errors import InputError, WorkError
 from data.lake import Lake
 from data.lakefile import measured_digest
-from tests.data.test_lake import make, same
-from tests.data.test_lake_crash import die_at, run
-
-
-@pytest.fixture(autouse=True)
-def quick_disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(os, "fsync", lambda fd: None)
-    yield
+from tests.data.lakes import crash_everywhere, files, make, plain, run, same
 
 
 @pytest.fixture
-def lake(tmp_path: Path) -> Lake:
-    lake = Lake(tmp_path / "lake")
+def lake(place: Path | str) -> Lake:
+    lake = Lake(place)
     lake.put_many([make("run1", seed=1), make("run2", seed=2), make("other", seed=3, machine="lathe")])
     return lake
 
 
-def plain(lake: Lake) -> set[str]:
-    """Batches that a plain reader finds."""
-    return {str(b) for f in lake.root.glob("machine=*/*/*.parquet") for b in pd.read_parquet(f)["batch"]}
+@pytest.fixture
+def folder(tmp_path: Path) -> Lake:
+    lake = Lake(tmp_path / "lake")
+    lake.put_many([make("run1", seed=1), make("run2", seed=2)])
+    return lake
+
+
+def versions_of(lake: Lake, batch_id: str) -> list[str]:
+    return [name for name in files(lake) if name.startswith(f"_versions/machine=vmc/{batch_id}/")]
 
 
 def test_a_withdrawn_batch_is_out_of_use_until_it_is_restored(lake: Lake) -> None:
@@ -81,15 +79,15 @@ def test_purged_content_is_gone_and_stays_out_until_it_is_forgotten(lake: Lake, 
     lake.quarantine(junk, "vmc", "junk")
     lake.withdraw("vmc", ["run1"], "private")
     assert lake.purge("vmc", ["*"]) == ["run1"] and lake.quarantined("vmc")
-    assert not (lake.root / "_versions/machine=vmc/run1").exists()
+    assert not versions_of(lake, "run1")
     assert lake.versions("vmc", "run1")[0].withdrawn.purged_at  # type: ignore[union-attr]
     assert lake.put(make("run1", seed=1)).status == "withdrawn"
-    assert not (lake.root / "_versions/machine=vmc/run1").exists()
+    assert not versions_of(lake, "run1")
     lake.restore("vmc", ["run1"])
     assert lake.put(make("run1", seed=1)).status == "new"
     lake.forget_machine("vmc", "sold")
     lake.purge("vmc", ["*"], quarantined=True)
-    left = [p.relative_to(lake.root).as_posix() for p in lake.root.rglob("*vmc*")]
+    left = [name for name in files(lake) if "vmc" in name]
     assert left == ["_manifest/machine=vmc.json"] and plain(lake) == {"other"}  # digests and reasons
 
 
@@ -114,10 +112,10 @@ def test_purging_keeps_versions_in_use(lake: Lake) -> None:
     ],
 )
 def test_what_cannot_be_done_changes_nothing(lake: Lake, call: object, words: str) -> None:
-    before = (lake.root / "_manifest/machine=vmc.json").read_bytes()
+    before = files(lake)
     with pytest.raises(InputError, match=words):
         call(lake)  # type: ignore[operator]
-    assert (lake.root / "_manifest/machine=vmc.json").read_bytes() == before
+    assert files(lake) == before
 
 
 def copy(of: Batch, batch_id: str) -> Batch:
@@ -142,7 +140,9 @@ def test_a_copy_is_left_out_where_batches_shall_be_distinct(lake: Lake) -> None:
         return stored.status, stored.batch_id
 
     assert put(copy(make("run1", seed=1), "run9")) == ("duplicate", "run1")
-    assert not (lake.root / "_versions/machine=vmc/run9").exists() and lake.batch_ids("vmc") == ["run1", "run2"]
+    assert lake.batch_ids("vmc") == ["run1", "run2"]
+    if isinstance(lake.root, Path):  # elsewhere another writer may just be using the file
+        assert not versions_of(lake, "run9")
     assert put(copy(make("run1", seed=1), "run1")) == ("new_version", "run1")  # other labels of the same batch
     assert put(replace(make("run1", seed=1), batch_id="x", machine="lathe")) == ("new", "x")
     lake.withdraw("vmc", ["run2"], "door open")
@@ -177,25 +177,18 @@ def test_two_writers_at_once_store_one_of_two_copies(tmp_path: Path) -> None:
     assert plain(lake) == set(lake.batch_ids("vmc"))
 
 
-def crash_everywhere(base: Path) -> None:
-    """Run in a process of its own: one forked child per point of death, until a child lives to the end."""
-    for n in range(1, 500):
-        root = base / f"{n:03d}"
-        Lake(root).put_many([make("run1", seed=1), make("run2", seed=2)])
-        child = os.fork()
-        if child == 0:
-            die_at(n)
-            Lake(root).withdraw("vmc", ["run1"], "x")
-            Lake(root).purge("vmc", ["run1"])
-            os._exit(0)
-        if os.waitpid(child, 0)[1] == 0:
-            return
+def crash_withdrawal(base: Path) -> None:
+    def work(root: Path) -> None:
+        Lake(root).withdraw("vmc", ["run1"], "x")
+        Lake(root).purge("vmc", ["run1"])
+
+    crash_everywhere(base, lambda root: Lake(root).put_many([make("run1", seed=1), make("run2", seed=2)]), work)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_kill_at_any_step_of_withdraw_and_purge_is_healed(tmp_path: Path) -> None:
     """Versions in use always load; the next write completes what was begun."""
-    assert run(f"crash_everywhere(t.Path({str(tmp_path)!r}))", "test_lake_withdrawal").wait(300) == 0
+    assert run(f"crash_withdrawal(t.Path({str(tmp_path)!r}))", "test_lake_withdrawal").wait(300) == 0
     states = []
     for root in sorted(tmp_path.iterdir()):
         lake = Lake(root)
@@ -215,32 +208,32 @@ def test_a_kill_at_any_step_of_withdraw_and_purge_is_healed(tmp_path: Path) -> N
      ("_versions/machine=vmc/run2/x.parquet", "file"),
      ("_versions/machine=vmc/run1/../../../../victim/data.parquet", "earlier"), ("../../victim", "year")],
 )  # fmt: skip
-def test_a_manifest_that_names_other_files_is_refused_and_nothing_is_deleted(lake: Lake, file: str, key: str) -> None:
-    victim = lake.root.parent / "victim" / "data.parquet"
+def test_a_manifest_that_names_other_files_is_refused_and_nothing_is_deleted(folder: Lake, file: str, key: str) -> None:
+    victim = folder.root.parent / "victim" / "data.parquet"
     victim.parent.mkdir()
     victim.write_text("not of this lake")
-    lake.withdraw("vmc", ["run1"], "private")
-    path = lake.root / "_manifest" / "machine=vmc.json"
+    folder.withdraw("vmc", ["run1"], "private")
+    path = folder.root / "_manifest" / "machine=vmc.json"
     manifest = json.loads(path.read_text())
     entry = manifest["machines"]["vmc"]["run1"][-1]
     entry[key] = [file] if key == "earlier" else file
     entry["sha256"] = {file: "0" * 64}
     path.write_text(json.dumps(manifest))
     with pytest.raises(WorkError, match=r"batch run1 of vmc: got (file|year) .*restore it from a backup"):
-        lake.purge("vmc", ["run1"])
-    assert victim.exists() and list((lake.root / "_versions/machine=vmc/run2").iterdir())
+        folder.purge("vmc", ["run1"])
+    assert victim.exists() and list((folder.root / "_versions/machine=vmc/run2").iterdir())
 
 
 def test_files_in_quarantine_are_for_their_owner_alone_and_large_ones_get_no_copy(
-    lake: Lake, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Lake, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small, large = tmp_path / "small.csv", tmp_path / "large.csv"
     small.write_text("secret")
     large.write_text("secret" * 100)
     monkeypatch.setattr("data.lake.COPY_MAX_BYTES", 500)
-    copies = lake.quarantine_many([(small, "bad"), (large, "bad"), (small, "bad")], "vmc")
+    copies = folder.quarantine_many([(small, "bad"), (large, "bad"), (small, "bad")], "vmc")
     assert [p.name for p in copies][1] == "reasons.jsonl" and copies[0] == copies[2]
     assert {oct(p.stat().st_mode & 0o777) for p in copies} == {"0o600"}
-    found = lake.quarantined("vmc")
+    found = folder.quarantined("vmc")
     assert [(e.name, e.copy is None) for e in found] == [("small.csv", False), ("large.csv", True)]
     assert "no copy kept: larger than" in found[1].reason

@@ -96,6 +96,10 @@ def saved(folder: Path, name: str, lines: Lines, encoding: str = "utf-8") -> Pat
     return folder / name
 
 
+def drafted_machine(*paths: Path) -> Machine:
+    return parse_machine(draft_machine_file(paths), "draft")
+
+
 def read(path: Path, text: str) -> Batch:
     (batch,) = read_batches(path, parse_machine(text, "draft"))
     return batch
@@ -127,7 +131,7 @@ def test_a_draft_reads_its_own_file(tmp_path: Path, name: str) -> None:
 )  # fmt: skip
 def test_a_column_of_values_near_22(tmp_path: Path, header: str, role: str, unit: str) -> None:
     path = saved(tmp_path, "run.csv", [f'time_s,"{header}",z_um', *rows("{s},{f},{z}")])
-    channel = next(iter(parse_machine(draft_machine_file([path]), "draft").channels.values()))
+    channel = next(iter(drafted_machine(path).channels.values()))
     assert (channel.role, channel.unit) == (role, unit)
 
 
@@ -136,7 +140,7 @@ def test_a_column_of_states_makes_no_long_table(tmp_path: Path) -> None:
     plain = rows("{t:%Y-%m-%d %H:%M:%S},{f},{z},")
     table = [x + ("rest" if i % 40 >= 20 else "heat") for i, x in enumerate([*plain, *plain[:5], *plain[:1] * 3])]
     path = saved(tmp_path, "run.csv", ["Time,T1,z_um,state", *table])
-    machine = parse_machine(draft_machine_file([path]), "draft")
+    machine = drafted_machine(path)
     assert machine.recording.pivot is None and machine.ignore == ["state"]
 
 
@@ -255,14 +259,10 @@ def test_a_draft_proposes_how_to_cut_one_long_recording(tmp_path: Path, pause_s:
 
 
 def test_a_line_that_says_simulated_marks_the_machine(tmp_path: Path) -> None:
-    path = saved(tmp_path, "a.csv", ["# simulated recording", HEAD, *rows("{t},{f},{b},{z}")])
-    assert parse_machine(draft_machine_file([path]), "draft").simulated
-    path = saved(
-        tmp_path, "c.csv", ["# simulated recording, sample year, seed 0, shop, hall", HEAD, *rows("{t},{f},{b},{z}")]
-    )
-    assert parse_machine(draft_machine_file([path]), "draft").simulated
+    for title in ("# simulated recording", "# simulated recording, sample year, seed 0, shop, hall"):
+        assert drafted_machine(saved(tmp_path, "a.csv", [title, HEAD, *rows("{t},{f},{b},{z}")])).simulated
     path = saved(tmp_path, "b.csv", ["Time,T_simulated,z_um", *rows("{t},{f},{z}")])
-    assert not parse_machine(draft_machine_file([path]), "draft").simulated
+    assert not drafted_machine(path).simulated
 
 
 def test_without_an_error_the_draft_says_how_to_name_one(tmp_path: Path) -> None:

@@ -51,6 +51,12 @@ def only(path: Path, machine: Machine):
     return batch
 
 
+def of_text(folder: Path, text: str, unit: str = "s"):
+    """The batch of a file with the columns t, front and z."""
+    (folder / "run.csv").write_text(text)
+    return only(folder / "run.csv", machine_for("t", "front", "z", unit=unit))
+
+
 def cell(x: float, decimal: str) -> str:
     return "" if np.isnan(x) else repr(float(x)).replace(".", decimal)
 
@@ -137,11 +143,9 @@ def test_xlsx_and_parquet_give_what_csv_gives(tmp_path, rows):
 
 
 def test_text_cells_are_read_where_one_reading_is_possible_else_counted(tmp_path):
-    path = tmp_path / "run.csv"
     cells = ["1,5", "1.234,5", "n/a", "---", "2.345", " 7 ", "NaN", "", "-1,2e1", "OL", "1e999", "3"]
     read = [1.5, 1234.5, None, None, None, 7.0, None, None, -12.0, None, None, 3.0]
-    path.write_text("t;front;z\n" + "".join(f"{10 * i};{c};{i},5\n" for i, c in enumerate(cells)))
-    batch = only(path, machine_for("t", "front", "z"))
+    batch = of_text(tmp_path, "t;front;z\n" + "".join(f"{10 * i};{c};{i},5\n" for i, c in enumerate(cells)))
     known = [i for i, x in enumerate(read) if x is not None]
     assert batch.values("front")[known].tolist() == [read[i] for i in known]
     assert batch.values("z").tolist() == [i + 0.5 for i in range(12)]
@@ -162,9 +166,7 @@ def test_one_cell(text, decimal, value):
 
 
 def test_trailing_separators_blank_lines_and_cut_rows(tmp_path):
-    path = tmp_path / "run.csv"
-    path.write_text("t,front,z\n0,20,1,\n\n10,21,2,\n20,22,3,\n30,23\n40,24,5,\n50,2")
-    batch = only(path, machine_for("t", "front", "z"))
+    batch = of_text(tmp_path, "t,front,z\n0,20,1,\n\n10,21,2,\n20,22,3,\n30,23\n40,24,5,\n50,2")
     assert batch.values("z").tolist() == [1, 2, 3, 4, 5]
     assert batch.repairs["ragged_rows"] == 2
     assert batch.repairs["rows_in"] == 6
@@ -172,11 +174,9 @@ def test_trailing_separators_blank_lines_and_cut_rows(tmp_path):
 
 
 def test_a_lone_quote_loses_no_row_silently(tmp_path):
-    path = tmp_path / "run.csv"
     rows = [f'{10 * i},"20",{i}' for i in range(40)]
     rows[20] = '200,"20,20'
-    path.write_text("t,front,z\n" + "\n".join(rows) + "\n")
-    batch = only(path, machine_for("t", "front", "z"))
+    batch = of_text(tmp_path, "t,front,z\n" + "\n".join(rows) + "\n")
     assert batch.repairs["rows_in"] == 40 == batch.repairs["rows_used"] + batch.repairs["rows_dropped"]
 
 
@@ -208,15 +208,9 @@ def test_encoding_is_settled_by_the_expected_names(tmp_path):
         assert tuple(c.strip("\ufeff") for c in unaided) == names, encoding
 
 
-STAMPS = {
-    "%Y-%m-%d %H:%M:%S": None,
-    "%Y-%m-%dT%H:%M:%S.%f": None,
-    "%d.%m.%Y %H:%M:%S": None,
-    "%Y/%m/%d %H:%M": None,
-    "%Y年%m月%d日 %H:%M:%S": None,
-    "%H:%M:%S": None,
-    "%d%m%y-%H%M%S": "%d%m%y-%H%M%S",
-}
+STAMPS = ("%Y-%m-%d %H:%M:%S", "%Y-%m-%dT%H:%M:%S.%f", "%d.%m.%Y %H:%M:%S", "%Y/%m/%d %H:%M", "%Y年%m月%d日 %H:%M:%S",
+          "%H:%M:%S", "%d%m%y-%H%M%S")  # fmt: skip
+UNKNOWN = STAMPS[-1]  # must be given
 
 
 @pytest.mark.parametrize("pattern", STAMPS)
@@ -225,7 +219,7 @@ def test_timestamps_as_text(tmp_path, pattern):
     stamps = [begin + pd.Timedelta(minutes=i) for i in range(6)]
     path = tmp_path / "run.csv"
     path.write_text("t;front;z\n" + "".join(f"{s.strftime(pattern)};20,5;{i},5\n" for i, s in enumerate(stamps)))
-    text = f"unit: timestamp, format: '{STAMPS[pattern]}'" if STAMPS[pattern] else "unit: timestamp"
+    text = "unit: timestamp" + f", format: '{pattern}'" * (pattern == UNKNOWN)
     machine = parse_machine(
         f"{{machine: mill, recording: {{time: {{column: t, {text}}}, step_s: 60}}, channels: {{"
         "front: {role: temperature, unit: degC}, z: {role: error, unit: um}}}",
@@ -239,18 +233,14 @@ def test_timestamps_as_text(tmp_path, pattern):
 def test_day_and_month_that_cannot_be_told_apart_are_asked_for(tmp_path):
     assert len(stamp_formats(["05/06/2024 10:00", "05/06/2024 10:01"])) == 2
     assert stamp_formats(["13/06/2024 10:00", "13/06/2024 10:01"]) == ["%d/%m/%Y %H:%M"]
-    path = tmp_path / "run.csv"
-    path.write_text("t,front,z\n05/06/2024 10:00,20,1\n05/06/2024 10:01,20,2\n")
     with pytest.raises(InputError, match=r"'%d/%m/%Y %H:%M' or '%m/%d/%Y %H:%M'; set recording.time.format"):
-        only(path, machine_for("t", "front", "z", unit="timestamp"))
+        of_text(tmp_path, "t,front,z\n05/06/2024 10:00,20,1\n05/06/2024 10:01,20,2\n", "timestamp")
 
 
 def test_stamps_with_an_offset_do_not_jump_with_summer_time(tmp_path):
-    path = tmp_path / "run.csv"
-    path.write_text(
-        "t,front,z\n2024-10-27T02:59:50+02:00,20,1\n2024-10-27T02:00:00+01:00,20,2\n2024-10-27T02:00:10+01:00,20,3\n"
-    )
-    batch = only(path, machine_for("t", "front", "z", unit="timestamp"))
+    stamps = ("2024-10-27T02:59:50+02:00", "2024-10-27T02:00:00+01:00", "2024-10-27T02:00:10+01:00")
+    rows = "".join(f"{stamp},20,{i}\n" for i, stamp in enumerate(stamps, 1))
+    batch = of_text(tmp_path, f"t,front,z\n{rows}", "timestamp")
     assert batch.values("z").tolist() == [1, 2, 3]
     assert batch.start == pd.Timestamp("2024-10-27 02:59:50")  # as the wall clock shows it
 
@@ -315,43 +305,8 @@ def test_unknown_suffix_lists_the_known_ones():
     assert type(reader_for(Path("RUN.CSV"))) is READERS["csv"]
 
 
-@pytest.mark.slow
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    kind=st.sampled_from(["csv", "xlsx", "parquet"]),
-    cut=st.floats(0, 1),
-    patches=st.lists(st.tuples(st.floats(0, 1), st.binary(min_size=1, max_size=6)), max_size=4),
-    unit=st.sampled_from(["s", "timestamp"]),
-)
-def test_random_corruption_gives_a_batch_or_one_clear_line(tmp_path, kind, cut, patches, unit):
-    path = tmp_path / f"run.{kind}"
-    frame = pd.DataFrame({"t": np.arange(60) * 10.0 + 1.7e9, "front": 20.0 + np.arange(60) / 10, "z": np.arange(60.0)})
-    if kind == "csv":
-        frame.to_csv(path, index=False)
-    elif kind == "xlsx":
-        frame.to_excel(path, index=False)
-    else:
-        frame.to_parquet(path)
-    raw = bytearray(path.read_bytes())
-    for where, patch in patches:
-        at = int(where * len(raw))
-        raw[at : at + len(patch)] = patch
-    path.write_bytes(bytes(raw[: max(1, int(len(raw) * (cut if cut < 0.9 else 1.0)))]))
-    try:
-        for batch in read_batches(path, machine_for("t", "front", "z", unit=unit)):
-            repairs = batch.repairs
-            assert repairs["rows_in"] == repairs["rows_used"] + repairs["rows_dropped"]
-            assert batch.n_rows == repairs["rows_out"] >= 2
-            assert np.isfinite(batch.values("z")).any()
-            assert np.allclose(np.diff(batch.time_s), 10.0)
-    except InputError as error:
-        assert str(error).startswith("run.") and "\n" not in str(error)
-
-
 def test_a_block_without_any_whole_row(tmp_path, monkeypatch):
     monkeypatch.setattr("data.readers.csv._BLOCK_BYTES", 32)
-    path = tmp_path / "run.csv"
-    path.write_text("t,front,z\n" + "0,1\n" * 20 + "".join(f"{10 * i},20,{i}\n" for i in range(50)))
-    batch = only(path, machine_for("t", "front", "z"))
+    batch = of_text(tmp_path, "t,front,z\n" + "0,1\n" * 20 + "".join(f"{10 * i},20,{i}\n" for i in range(50)))
     assert batch.values("z").tolist() == list(range(50))
     assert (batch.repairs["ragged_rows"], batch.repairs["rows_in"]) == (20, 70)

@@ -86,41 +86,41 @@ def test_equal_times_are_averaged_and_drivers_take_the_last():
     assert out.columns["v"].tolist() == [0.0, 3.0, 5.0]
     assert out.columns["rpm"].tolist() == [0.0, 6.0, 5.0]
     assert out.used.all()
-    assert repair_time(t, 100.0).counts["duplicates"] == 2
 
 
-def test_rows_out_of_order_are_sorted_and_counted():
-    t = np.arange(0, 100, 10.0)
-    mixed = t.copy()
-    mixed[[3, 4]] = mixed[[4, 3]]
-    repaired = repair_time(mixed + 7.0, 60.0)
-    assert np.array_equal(repaired.time_s, t)
-    assert repaired.order.tolist() == [0, 1, 2, 4, 3, 5, 6, 7, 8, 9]
-    assert repaired.start == 7.0
-    assert repaired.counts["backward_steps"] == 1
-    assert repaired.counts["clock_restarts"] == 0
+TENS = np.arange(0, 2000, 10.0)
+SWAPPED = np.array([0, 1, 2, 4, 3, 5, 6, 7, 8, 9])
+# time column, max_gap_s, repaired times, rows in their order, and counts
+REPAIRS: dict[str, tuple[np.ndarray, float, np.ndarray, np.ndarray, dict[str, int]]] = {
+    "rows out of order are sorted": (
+        TENS[SWAPPED] + 7.0, 60.0, TENS[:10], SWAPPED, {"backward_steps": 1, "clock_restarts": 0}
+    ),
+    "a second half that is written first": (
+        np.roll(TENS, 100), 60.0, TENS, np.roll(np.arange(200), 100), {"clock_restarts": 0}
+    ),
+    "a restarted clock is carried on one interval later": (
+        np.append(TENS[:100], TENS[:50]), 60.0, TENS[:150], np.arange(150), {"clock_restarts": 1, "backward_steps": 1}
+    ),
+    "a clock that is set back by an hour": (
+        np.append(np.arange(0, 7200, 60.0), np.arange(3600, 9000, 60.0)), 300.0, np.arange(210) * 60.0, np.arange(210),
+        {"clock_restarts": 1},
+    ),
+    "times that cannot be read are dropped": (
+        np.array([np.nan, 0.0, np.inf, 10.0, 1e300, 20.0]), 60.0, TENS[:3], np.array([1, 3, 5]), {"unparsable_time": 3}
+    ),
+    "equal times": (np.array([0, 10.0, 10, 10, 20]), 100.0, TENS[[0, 1, 1, 1, 2]], np.arange(5), {"duplicates": 2}),
+    "long holes": (
+        np.array([0.0, 10, 20, 200, 210, 500]), 100.0, np.array([0.0, 10, 20, 200, 210, 500]), np.arange(6), {"gaps": 2}
+    ),
+}  # fmt: skip
 
 
-def test_second_half_written_first_is_sorted():
-    t = np.concatenate([np.arange(1000, 2000, 10.0), np.arange(0, 1000, 10.0)])
-    repaired = repair_time(t, 60.0)
-    assert np.array_equal(repaired.time_s, np.arange(0, 2000, 10.0))
-    assert repaired.counts["clock_restarts"] == 0
-
-
-def test_restarted_clock_is_carried_on_one_interval_later():
-    t = np.concatenate([np.arange(0, 1000, 10.0), np.arange(0, 500, 10.0)])
-    repaired = repair_time(t, 60.0)
-    assert np.array_equal(repaired.time_s, np.arange(0, 1500, 10.0))
-    assert np.array_equal(repaired.order, np.arange(150))
-    assert repaired.counts["clock_restarts"] == 1
-    assert repaired.counts["backward_steps"] == 1
-
-
-def test_clock_set_back_by_an_hour_is_carried_on():
-    t = np.concatenate([np.arange(0, 7200, 60.0), np.arange(3600, 9000, 60.0)])
-    repaired = repair_time(t, 300.0)
-    assert np.array_equal(repaired.time_s, np.arange(0, 210) * 60.0)
+@pytest.mark.parametrize("what", REPAIRS)
+def test_a_time_column_is_repaired(what: str):
+    t, max_gap_s, time_s, order, counts = REPAIRS[what]
+    repaired = repair_time(t, max_gap_s)
+    assert np.array_equal(repaired.time_s, time_s) and np.array_equal(repaired.order, order)
+    assert repaired.start == t[order[0]] and repaired.counts | counts == repaired.counts
 
 
 @pytest.mark.parametrize("row", [0, 17, 99])
@@ -132,16 +132,6 @@ def test_lone_wrong_time_is_dropped(row: int, wrong: float):
     assert repaired.counts["time_outliers"] == 1
     assert row not in repaired.order
     assert np.ptp(repaired.time_s) <= 99.0
-
-
-def test_unreadable_times_are_dropped_and_counted():
-    repaired = repair_time(np.array([np.nan, 0.0, np.inf, 10.0, 1e300, 20.0]), 60.0)
-    assert repaired.order.tolist() == [1, 3, 5]
-    assert repaired.counts["unparsable_time"] == 3
-
-
-def test_long_holes_are_counted():
-    assert repair_time(np.array([0.0, 10, 20, 200, 210, 500]), 100.0).counts["gaps"] == 2
 
 
 def test_time_in_minutes_meets_the_last_grid_point():
