@@ -302,6 +302,8 @@ class Bucket:
 
         try:
             return getattr(obstore, call)(self._objects, *args, **options)
+        except FileNotFoundError as error:
+            raise FileNotFoundError(_first_line(error)) from None
         except (OSError, obstore.exceptions.AlreadyExistsError, obstore.exceptions.PreconditionError):
             raise
         except Exception as error:
