@@ -20,10 +20,10 @@ from models.crossing import Plan
 from models.metrics import residual_std_um
 from models.trust import farthest, watched
 from pipelines import fleet_state, model_store, registry, settings, training, watching
+from pipelines.alerts import fleet_view
 from pipelines.caller import DirectCaller
 from pipelines.commands.status import newest_reports
 from pipelines.fleet import Fleet, FleetMachine
-from pipelines.fleet_view import fleet_view
 from pipelines.recordings import home_lake, load_batches
 from pipelines.request import TrainRequest
 from tests.toys.small_year import recording, write_machine, write_year
