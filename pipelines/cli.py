@@ -14,17 +14,14 @@ import typer
 from data.errors import InputError, WorkError, place_of
 from pipelines import console, stopping
 from pipelines.commands.calibrate import calibrate
-from pipelines.commands.compensate import compensate
+from pipelines.commands.compensate import compensate, export, rehearse
 from pipelines.commands.demonstrate import demonstrate
 from pipelines.commands.describe import describe
 from pipelines.commands.diagnose import diagnose
-from pipelines.commands.export import export
 from pipelines.commands.ingest import ingest
 from pipelines.commands.lake import app as lake
 from pipelines.commands.predict import predict
-from pipelines.commands.promote import promote, rollback
-from pipelines.commands.registry import registry
-from pipelines.commands.rehearse import rehearse
+from pipelines.commands.registry import promote, registry, rollback
 from pipelines.commands.replay import replay
 from pipelines.commands.report import report
 from pipelines.commands.schedule import schedule

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -27,20 +26,13 @@ SAME_SHARE = 0.05  # of a driver's range in the plan: as near a shop comes to a 
 SAME_ROWS = 0.9  # of the plan's time: a shop switches a little sooner or later
 
 
-@dataclass(frozen=True)
-class ContinueRequest:
-    """An earlier diagnosis' folder and new recordings. `machine_file`: instead of the one that was diagnosed."""
-
-    out: Path
-    recordings: tuple[Path, ...]
-    machine_file: Path | None = None
-    seed: int | None = None
-    report: bool = True
-
-
 def continue_diagnosis(
-    request: ContinueRequest,
+    out: Path,
+    recordings: tuple[Path, ...],
     settings: Settings,
+    machine_file: Path | None = None,
+    seed: int | None = None,
+    report: bool = True,
     say: Say = lambda text: None,
     done: Done | None = None,
     caller: Caller | None = None,
@@ -50,25 +42,30 @@ def continue_diagnosis(
 
     The earlier findings stay as `findings.1.json`, `findings.2.json`, …
 
+    Args:
+        out: folder of the earlier diagnosis.
+        machine_file: instead of the one that was diagnosed.
+        seed: of all random draws; default: the earlier one's.
+
     Raises:
         InputError: no earlier diagnosis, another machine, a recording that it has used already, or one of its
             recordings that the lake does not hold any more.
         WorkError: as `diagnose_file`.
     """
-    if not request.recordings:
+    if not recordings:
         raise InputError("--continue: no new recordings; give them by --recordings")
-    before = read_inputs(request.out)
-    findings = read_findings(request.out / FINDINGS)
-    check_recordings(request.recordings)
-    check_folder(request.out, [request.out / n for n in FILES], overwrite=True)
-    machine, file, text = _machine(request, before)
+    before = read_inputs(out)
+    findings = read_findings(out / FINDINGS)
+    check_recordings(recordings)
+    check_folder(out, [out / n for n in FILES], overwrite=True)
+    machine, file, text = _machine(out, machine_file, before)
     caller = caller or DirectCaller()
     gather = partial(gather_batches, machine, batch_ids=(), say=say)
-    gathered: Gathered = caller.map("ingest", gather, [request.recordings], retries=RETRIES)[0]
-    batches, new = joined(before, gathered.batches, load_batches(home_lake(), machine), request.out, say)
-    continued = Continued(findings, new, made(request.out / PLAN, machine, [b for b in batches if b.batch_id in new]))
-    seed = before.seed if request.seed is None else request.seed
-    again = DiagnosisRequest(file, request.out, request.recordings, (), seed, request.report, overwrite=True)
+    gathered: Gathered = caller.map("ingest", gather, [recordings], retries=RETRIES)[0]
+    batches, new = joined(before, gathered.batches, load_batches(home_lake(), machine), out, say)
+    continued = Continued(findings, new, made(out / PLAN, machine, [b for b in batches if b.batch_id in new]))
+    seed = before.seed if seed is None else seed
+    again = DiagnosisRequest(file, out, recordings, (), seed, report, overwrite=True)
     together = Gathered(tuple(batches), gathered.ingested)
     return finished(again, machine, text, together, settings, say, done, caller, work, continued)
 
@@ -148,19 +145,19 @@ def _gone(gone: Sequence[Recorded], machine: str, out: Path) -> str:
     )
 
 
-def _machine(request: ContinueRequest, before: Inputs) -> tuple[Machine, Path, str]:
+def _machine(out: Path, machine_file: Path | None, before: Inputs) -> tuple[Machine, Path, str]:
     """The machine, its file's name and its text: as it was diagnosed, or from a file of the same machine.
 
     Raises:
         InputError: the file is of another machine.
     """
-    if request.machine_file is None:
+    if machine_file is None:
         text = before.machine_text
-        return parse_machine(text, f"machine file of {request.out}"), Path(before.machine_file), text
-    machine = load_machine(request.machine_file)
+        return parse_machine(text, f"machine file of {out}"), Path(before.machine_file), text
+    machine = load_machine(machine_file)
     if machine.machine != before.machine:
         raise InputError(
-            f"--continue {request.out}: is a diagnosis of {before.machine}, and {request.machine_file} is a file of "
+            f"--continue {out}: is a diagnosis of {before.machine}, and {machine_file} is a file of "
             f"{machine.machine}; leave --machine out, or give the folder of its own diagnosis"
         )
-    return machine, request.machine_file, request.machine_file.read_text(encoding="utf-8")
+    return machine, machine_file, machine_file.read_text(encoding="utf-8")

@@ -37,7 +37,7 @@ from models.outlook import outlook
 from models.promotion import Choice, choose, judged
 from models.protocols import PromotionRule
 from models.result import GridResult, Training
-from pipelines import local_store, store
+from pipelines import store
 from pipelines.audit import CHAMPION
 from pipelines.caller import Say
 from pipelines.runs import (
@@ -80,11 +80,11 @@ def open_store(settings: Settings, say: Say = lambda text: None) -> MlflowClient
     """
     file = settings.store_file
     with _OPENING, store_errors(settings):
-        if file is not None and not local_store.is_made(file):
+        if file is not None and not store.is_made(file):
             say(f"first use: making the tracking store {file} (takes some seconds, once)")
-            local_store.make(file, lambda made: MlflowClient(f"sqlite:///{made}").search_experiments(max_results=1))
+            store.make(file, lambda made: MlflowClient(f"sqlite:///{made}").search_experiments(max_results=1))
         own = settings.artifacts_uri
-        if file is not None and own and settings.store_uri not in _opened and local_store.follow(file, own):
+        if file is not None and own and settings.store_uri not in _opened and store.follow(file, own):
             say(f"the home has moved: addresses in the tracking store now lead to {own}")
         # MLflow looks up a logged model's files in the process-wide store, whatever store is requested.
         mlflow.set_tracking_uri(settings.store_uri)

@@ -313,12 +313,13 @@ def replay(
     """
     from models.crossing import Plan
     from pipelines.commands.replay import replay_year
+    from pipelines.replay import ReplayRequest
 
-    quick = Plan(effort="quick")
-    return replay_year(
-        Path(machine_file), tuple(_paths(recordings)), Path(out), tuple(channels), plan or quick, start, every, disturb,
-        _log, lambda step, n, of: None, processes,
+    request = ReplayRequest(
+        Path(machine_file), tuple(_paths(recordings)), Path(out), tuple(channels), plan or Plan(effort="quick"), start,
+        every, disturb, processes,
     )  # fmt: skip
+    return replay_year(request, _log, lambda step, n, of: None)
 
 
 def export(models: Paths, to: str, out: Path | str | None = None, *, provisional: bool = False) -> list[Path]:

@@ -13,7 +13,6 @@ import typer
 
 from data.errors import InputError
 from pipelines import console
-from pipelines.caller import Done, Say
 from pipelines.options import Json, MachineFile, split
 
 if TYPE_CHECKING:
@@ -28,21 +27,6 @@ SHOWN = 8  # directions that the recordings do not determine; --json lists all
 
 
 @dataclass(frozen=True)
-class CalibrationRequest:
-    """What to calibrate. `recordings` empty: what the lake holds. `batch_ids` empty: all of them."""
-
-    machine_file: Path
-    out: Path
-    recordings: tuple[Path, ...] = ()
-    batch_ids: tuple[str, ...] = ()
-    starts: int = 1
-    leave_out: bool = True
-    report: bool = True
-    overwrite: bool = False
-    seed: int = 0
-
-
-@dataclass(frozen=True)
 class CalibrationOutcome:
     """A calibration and the file that it was written to."""
 
@@ -51,43 +35,6 @@ class CalibrationOutcome:
     when: str
     account: Account
     report: Path | None = None
-
-
-def calibrate_file(request: CalibrationRequest, say: Say, done: Done) -> CalibrationOutcome:
-    """Calibrate a machine file on recordings and write the calibrated one.
-
-    Files and options are checked before the work starts.
-
-    Raises:
-        InputError: a file, batch or option that cannot be used.
-        WorkError: the fit did not converge, or the file cannot be written; what stood there is unchanged.
-    """
-    from data.account import Account
-    from pipelines.recordings import gather_batches
-    from twin.calibration import CalibrationOptions, calibrate
-
-    if request.starts < 1:
-        raise InputError(f"--starts: got {request.starts}, expected 1 or more")
-    machine, text = check_calibrated(request.machine_file, request.out, request.overwrite)
-    batches = gather_batches(machine, request.recordings, request.batch_ids, say).batches
-    say(f"calibrate {machine.machine}: {len(batches)} batches")
-
-    def progress(step: str, n: int, of: int) -> None:
-        done(step, n, of) if of else say(step)
-
-    options = CalibrationOptions(
-        request.starts, request.seed, leave_out=request.leave_out and len(batches) > 1, processes=os.cpu_count() or 1
-    )
-    found = calibrate(machine, batches, options, progress)
-    when = write_calibrated(found, text, request.machine_file, request.out, request.overwrite)
-    if not request.report:
-        return CalibrationOutcome(found, request.out, when, Account.of(batches))
-    from reports.twin.page import twin_data, write_twin_report
-
-    say("pictures")
-    page = request.out.with_suffix(".html")
-    write_twin_report(page, twin_data(machine, batches, found))
-    return CalibrationOutcome(found, request.out, when, Account.of(batches), page)
 
 
 def check_calibrated(machine_file: Path, out: Path, overwrite: bool) -> tuple[Machine, str]:
@@ -257,11 +204,28 @@ def calibrate(
     as_json: Json = False,
 ) -> None:
     """Fit the machine file's free parameters to recordings: values with 90 % intervals, and their left-out errors."""
-    request = CalibrationRequest(
-        machine, to, tuple(recordings or ()), split(batches), starts, leave_out, report, overwrite
-    )
+    from data.account import Account
+    from pipelines.recordings import gather_batches
+    from twin.calibration import CalibrationOptions
+    from twin.calibration import calibrate as fit
+
+    if starts < 1:
+        raise InputError(f"--starts: got {starts}, expected 1 or more")
+    known, text = check_calibrated(machine, to, overwrite)
     with console.progress(as_json) as (say, done):
-        outcome = calibrate_file(request, say, done)
+        gathered = gather_batches(known, tuple(recordings or ()), split(batches), say).batches
+        say(f"calibrate {known.machine}: {len(gathered)} batches")
+        options = CalibrationOptions(starts, leave_out=leave_out and len(gathered) > 1, processes=os.cpu_count() or 1)
+        found = fit(known, gathered, options, lambda step, n, of: done(step, n, of) if of else say(step))
+        when = write_calibrated(found, text, machine, to, overwrite)
+        page = None
+        if report:
+            from reports.twin.page import twin_data, write_twin_report
+
+            say("pictures")
+            page = to.with_suffix(".html")
+            write_twin_report(page, twin_data(known, gathered, found))
+    outcome = CalibrationOutcome(found, to, when, Account.of(gathered), page)
     if as_json:
         console.print_json(calibration_dict(outcome))
     else:

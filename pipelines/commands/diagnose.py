@@ -149,15 +149,14 @@ def diagnose(
     from pipelines import settings
 
     settings.configure_environment()
-    from pipelines.continuing import ContinueRequest, continue_diagnosis
+    from pipelines.continuing import continue_diagnosis
     from pipelines.diagnosing import DiagnosisRequest, diagnose_file
 
     given = tuple(recordings or ())
     if earlier is not None:
         _check_alone(earlier, {"--out": to, "--batches": batches, "--overwrite": overwrite})
-        more = ContinueRequest(earlier, given, machine, seed, report)
         with console.progress(as_json) as (say, done):
-            outcome = continue_diagnosis(more, settings.load(), say, done)
+            outcome = continue_diagnosis(earlier, given, settings.load(), machine, seed, report, say=say, done=done)
     else:
         file, out = _needed("--machine", machine), _needed("--out", to)
         request = DiagnosisRequest(file, out, given, split(batches), seed or 0, report, overwrite)

@@ -9,11 +9,12 @@ import typer
 
 from data.errors import one_of
 from pipelines import console
+from pipelines.caller import Done, Say
 from pipelines.options import Json, MachineFile, split
 
 if TYPE_CHECKING:
-    from models.crossing import Plan
     from models.replay import Replay, Retraining, Score
+    from pipelines.replay import ReplayRequest
 
 
 def print_replay(r: Replay) -> None:
@@ -63,19 +64,14 @@ def write_replay_files(r: Replay, out: Path) -> tuple[Path, Path]:
     return out / "replay.json", out / "replay.html"
 
 
-def replay_year(
-    machine: Path, recordings: tuple[Path, ...], out: Path, targets: tuple[str, ...], plan: Plan, start: int,
-    every: int, seed: int | None, say: console.Say, done: console.Done,
-    processes: int = 0,
-) -> Replay:  # fmt: skip
+def replay_year(request: ReplayRequest, say: Say, done: Done) -> Replay:
     """Replay and write its files; nothing is written elsewhere, so the home's environment is not configured."""
     from pipelines import settings
     from pipelines.caller import DirectCaller
-    from pipelines.replay import ReplayRequest, replay
+    from pipelines.replay import replay
 
-    request = ReplayRequest(machine, recordings, out, targets, plan, start, every, seed, processes)
     result = replay(request, settings.load(), DirectCaller(), say, done)
-    write_replay_files(result, out)
+    write_replay_files(result, request.out)
     return result
 
 
@@ -98,10 +94,12 @@ def replay(
     goes on where it was stopped.
     """
     from models.crossing import FINALISTS, Plan
+    from pipelines.replay import ReplayRequest
 
     plan = Plan(effort=one_of(effort, FINALISTS, "--effort"))
+    request = ReplayRequest(machine, tuple(recordings), out, split(channels), plan, start, every, disturb)
     with console.progress(as_json) as (say, done):
-        result = replay_year(machine, tuple(recordings), out, split(channels), plan, start, every, disturb, say, done)
+        result = replay_year(request, say, done)
     if as_json:
         console.print_json(result.as_dict())
         return

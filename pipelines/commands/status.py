@@ -18,7 +18,7 @@ from pipelines.home import home
 from pipelines.options import Json
 
 if TYPE_CHECKING:
-    from pipelines.fleet_view import FleetView, Row
+    from pipelines.alerts import FleetView, Row
 
 TRAININGS_SHOWN = 12
 ALERT_CODE = 3
@@ -136,7 +136,7 @@ def status(
 
     _deliver()
     found = watching.warm() or _gathered(as_json)
-    from pipelines.fleet_view import fleet_view
+    from pipelines.alerts import fleet_view
 
     view = fleet_view(Path(found["home"]), found["channels"])
     if html is not None:

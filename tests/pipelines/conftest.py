@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from pipelines import settings as settings_module
+from tests.toys.command import Call, in_process
 
 PNG = bytes.fromhex(  # one grey pixel
     "89504e470d0a1a0a0000000d49484452000000010000000108000000003a7e9b55"
@@ -43,6 +44,12 @@ def plain_pictures(request: pytest.FixtureRequest) -> Iterator[None]:
             patch.setattr(Figure, "savefig", save)
             patch.setattr(page, "write_diagnosis_report", write_without)
         yield
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
+    """`thermodrift ARGS` in this process."""
+    return in_process(monkeypatch, capsys)
 
 
 @pytest.fixture(scope="session")

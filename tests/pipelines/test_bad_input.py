@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ import pandas as pd
 import pytest
 
 from data.lake import Lake
-from pipelines import cli
+from tests.toys.command import Call, Done
 from tests.toys.small_year import recording, write_machine, write_year
 
 NAME = "small-bad"
@@ -26,13 +25,13 @@ class Place:
 
     folder: Path
     machine: Path
-    call: Callable[..., tuple[int, str, str]]
+    call: Call
 
     @property
     def lake(self) -> Lake:
         return Lake(self.folder / "home" / "lake")
 
-    def ingest(self, *paths: Path) -> tuple[int, str, str]:
+    def ingest(self, *paths: Path) -> Done:
         return self.call("ingest", *paths, "--machine", self.machine)
 
     def reasons(self) -> dict[str, str]:
@@ -40,17 +39,8 @@ class Place:
 
 
 @pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Place:
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: Call) -> Place:
     monkeypatch.setenv("THERMODRIFT_HOME", str(tmp_path / "home"))
-
-    def call(*args: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["thermodrift", *map(str, args)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        shown = capsys.readouterr()
-        return int(ended.value.code or 0), shown.out, shown.err
-
     return Place(tmp_path, write_machine(tmp_path / "small.yml", NAME), call)
 
 

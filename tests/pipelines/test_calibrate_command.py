@@ -4,26 +4,19 @@ from __future__ import annotations
 
 import copy
 import json
-import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 import yaml
 
 from data.machine import load_machine
-from pipelines import cli
+from tests.toys.command import Call
 from tests.twin.machines import TWO_BODIES
 from tests.twin.recordings import empty_batches, recorded
 from twin.compile import compile_network
 from twin.schema import twin_part
-
-
-@dataclass
-class Done:
-    code: int
-    out: str
-    err: str
 
 
 @pytest.fixture
@@ -45,23 +38,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def call(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
+def call(folder: Path, monkeypatch: pytest.MonkeyPatch, call: Call) -> Call:
     """`thermodrift calibrate --machine two.yml --out new.yml ARGS` in this process, on one core."""
     monkeypatch.setattr("os.cpu_count", lambda: 1)
-
-    def run(*args: object) -> Done:
-        given = ["calibrate", "--machine", folder / "two.yml", "--out", folder / "new.yml", *args]
-        monkeypatch.setattr(sys, "argv", ["thermodrift", *map(str, given)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        shown = capsys.readouterr()
-        return Done(int(ended.value.code or 0), shown.out, shown.err)
-
-    return run
+    return partial(call, "calibrate", "--machine", folder / "two.yml", "--out", folder / "new.yml")
 
 
-def test_recordings_become_a_calibrated_file(folder: Path, call) -> None:  # type: ignore[no-untyped-def]
+def test_recordings_become_a_calibrated_file(folder: Path, call: Call) -> None:
     done = call("--recordings", folder / "in")
     assert done.code == 0, done.err
     assert "4 parameters from 3 batches  (simulated recordings); converged after" in done.out
@@ -80,7 +63,7 @@ def test_recordings_become_a_calibrated_file(folder: Path, call) -> None:  # typ
     assert again.code == 2 and "new.yml: exists; give another file" in again.err
 
 
-def test_json_is_clean_and_the_lake_is_the_default(folder: Path, call) -> None:  # type: ignore[no-untyped-def]
+def test_json_is_clean_and_the_lake_is_the_default(folder: Path, call: Call) -> None:
     assert call("--recordings", folder / "in", "--no-leave-out", "--no-report").code == 0
     done = call("--batches", "b00,b02", "--no-leave-out", "--no-report", "--overwrite", "--json")
     assert done.code == 0, done.err
@@ -91,11 +74,7 @@ def test_json_is_clean_and_the_lake_is_the_default(folder: Path, call) -> None: 
     assert low < told["parameters"][0]["value"] < high
 
 
-def test_a_fit_that_fails_leaves_the_file_untouched(
-    folder: Path,
-    call,
-    monkeypatch: pytest.MonkeyPatch,  # type: ignore[no-untyped-def]
-) -> None:
+def test_a_fit_that_fails_leaves_the_file_untouched(folder: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder / "new.yml").write_text("what stood there", encoding="utf-8")
     from twin.calibration import estimate
 
@@ -110,7 +89,7 @@ def test_a_fit_that_fails_leaves_the_file_untouched(
     assert (folder / "new.yml").read_text(encoding="utf-8") == "what stood there"
 
 
-def test_bad_input_is_one_line_and_exit_code_2(folder: Path, call) -> None:  # type: ignore[no-untyped-def]
+def test_bad_input_is_one_line_and_exit_code_2(folder: Path, call: Call) -> None:
     cases = [
         (("--recordings", folder / "absent"), "absent: no such file or folder"),
         (("--starts", "0"), "--starts: got 0, expected 1 or more"),

@@ -16,17 +16,11 @@ import pytest
 
 from pipelines import cli
 from pipelines.commands.ingest import print_findings
-from tests.toys.command import Call, in_process
+from tests.toys.command import Call
 from tests.toys.small_year import law_um, write_machine, write_year
 
 ROOT = Path(cli.__file__).resolve().parents[1]
 NAME = "small-cli"
-
-
-@pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
-    """`thermodrift ARGS` in this process."""
-    return in_process(monkeypatch, capsys)
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,24 +9,11 @@ import yaml
 
 from pipelines import cli, console
 from pipelines.commands.describe import describe_twin
+from tests.toys.command import Call
 from tests.twin.machines import TWO_BODIES
 
 pytestmark = pytest.mark.drawn
 MACHINES = Path(cli.__file__).resolve().parents[1] / "machines"
-Call = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
-    def run(*args: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["thermodrift", "describe", *map(str, args)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        shown = capsys.readouterr()
-        return int(ended.value.code or 0), shown.out, shown.err
-
-    return run
 
 
 @pytest.fixture
@@ -41,7 +26,9 @@ def two(tmp_path: Path) -> Path:
 def test_tables_and_picture_of_the_sample_machine(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(console.out, "width", 220)  # whatever width an earlier test has set
     out = tmp_path / "network.svg"
-    code, said, err = call("--twin", MACHINES / "sample_vmc.yml", "--at", "spindle_rpm=6 krpm", "--out", out)
+    code, said, err = call(
+        "describe", "--twin", MACHINES / "sample_vmc.yml", "--at", "spindle_rpm=6 krpm", "--out", out
+    )
     assert code == 0 and err == "" and out.read_text(encoding="utf-8").startswith("<?xml")
     assert "sample_vmc (SIMULATED): 14 bodies, 16 links, 17 exposures, 9 sensors; 60 free and 81 fixed" in said
     for words in ("1100 kJ/K", "test mandrel", "bed and table against the room", "7.7 h", "49 min", str(out)):
@@ -87,6 +74,6 @@ def test_the_html_holds_parameters_and_modes(two: Path, tmp_path: Path) -> None:
 def test_what_cannot_be_described_is_one_line(call: Call, two: Path, args: tuple[object, ...], said: str) -> None:
     two.with_suffix(".svg").write_text("mine", encoding="utf-8")
     names = {"TWO": two, "TWO.svg": two.with_suffix(".svg")}
-    code, out, err = call(*(names.get(str(a), a) for a in args))
+    code, out, err = call("describe", *(names.get(str(a), a) for a in args))
     assert code == 2 and out == "" and said in err and err.count("\n") == 1 and "Traceback" not in err
     assert two.with_suffix(".svg").read_text(encoding="utf-8") == "mine"

@@ -81,10 +81,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Given:
 def recorded(given: Given) -> Replay:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("THERMODRIFT_HOME", str(given.folder / "mine"))
-        result = replay_year(
-            given.machine, (given.year,), given.folder / "recorded", ("z",), PLAN, START, EVERY, None,
-            lambda text: None, lambda step, n, of: None, 1,
-        )  # fmt: skip
+        result = replay_year(given.request("recorded"), lambda text: None, lambda step, n, of: None)
     assert not (given.folder / "mine").exists()
     return result
 
@@ -234,8 +231,8 @@ def test_the_command_and_recordings_with_several_runs_in_a_file(tmp_path: Path) 
         rest = table.tail(1).assign(speed=0.0, time_s=table["time_s"].iloc[-1] + 300.0)
         parts += [table, rest]
     pd.concat(parts).to_csv(tmp_path / "in" / "20250101.csv", index=False)
-    request = (machine, (tmp_path / "in",), tmp_path / "out", ("z",), PLAN, 6, 2, None)
-    result = replay_year(*request, lambda text: None, lambda step, n, of: None, 1)
+    request = ReplayRequest(machine, (tmp_path / "in",), tmp_path / "out", ("z",), PLAN, 6, 2, workers=1)
+    result = replay_year(request, lambda text: None, lambda step, n, of: None)
     assert len(result.runs) == 3 and (tmp_path / "out" / "replay.html").is_file()
     assert all(math.isfinite(r.none_S_um) for r in result.runs)
     assert np.all(np.diff([r.arrival for r in result.runs]) > 0)

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,13 @@ from models.crossing import Plan
 from models.metrics import residual_std_um
 from models.trust import farthest, watched
 from pipelines import fleet_state, model_store, registry, settings, training, watching
+from pipelines.alerts import fleet_view
 from pipelines.caller import DirectCaller
 from pipelines.commands.status import newest_reports
 from pipelines.fleet import Fleet, FleetMachine
-from pipelines.fleet_view import fleet_view
 from pipelines.recordings import home_lake, load_batches
 from pipelines.request import TrainRequest
+from tests.toys.command import in_process
 from tests.toys.small_year import recording, write_machine, write_year
 
 NAME = "watched"
@@ -163,15 +165,7 @@ def test_a_model_that_cannot_be_read_is_said(place: Place) -> None:
 def test_the_command_shows_it_and_fails_on_alert(
     place: Place, capfd: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pipelines import cli
-
-    def call(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["thermodrift", "status", *arguments])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        shown = capfd.readouterr()
-        return int(ended.value.code or 0), shown.out, shown.err
-
+    call = partial(in_process(monkeypatch, capfd), "status")
     fleet_state.note_run(place.home, NAME, datetime(2025, 9, 20, tzinfo=UTC), False, "the share is away")
     code, out, _ = call()
     table = out.partition("Alerts")[0].splitlines()
