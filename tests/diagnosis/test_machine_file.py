@@ -15,17 +15,20 @@ from data.errors import InputError, WorkError
 from data.machine import parse_machine
 from diagnosis.export import machine_file
 from diagnosis.export.machine_file import diagnosed_text, drafted_text
-from twin.calibration.calibrated_file import Origin, calibrated_text
+from twin.calibration.calibrated_file import calibrated_text
 from twin.calibration.identifiability import Interval
 from twin.compile import compile_network, own_paths
 from twin.network import Network
 from twin.quantity import Value
-from twin.schema import Body, Link, MechanismPart, Sensor, TwinPart, twin_part
+from twin.schema import Body, Calibrated, Link, MechanismPart, Sensor, TwinPart, twin_part
 
 SAMPLE = (Path(__file__).parents[2] / "machines" / "sample_vmc.yml").read_text(encoding="utf-8")
 WHERE = "OUT/machine.yml"
 NOTE = "Found 2026-11-21 in 12 batches: probability 0.97, gain 41 nats in runs left out of the fit"
-ORIGIN = Origin(("b1", "b2"), "2026-11-21T10:00:00+01:00", True, {"z_um": 1.4321}, "diagnosed")
+ORIGIN = Calibrated(
+    batches=("b1", "b2"), when="2026-11-21T10:00:00+01:00", simulated=True, left_out_rms={"z_um": 1.4321},
+    words="diagnosed",
+)  # fmt: skip
 SINK = MechanismPart(
     law="floor_sink",
     at="head",

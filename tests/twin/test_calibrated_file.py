@@ -8,11 +8,11 @@ import pytest
 
 from data.errors import InputError, WorkError
 from data.machine import load_machine, parse_machine
-from twin.calibration.calibrated_file import Origin, calibrated_text, check_writable, write_file
+from twin.calibration.calibrated_file import calibrated_text, check_writable, write_file
 from twin.calibration.identifiability import Interval
 from twin.compile import compile_network
 from twin.network import Network
-from twin.schema import twin_part
+from twin.schema import Calibrated, twin_part
 
 TEXT = """# by hand
 machine: two
@@ -30,7 +30,10 @@ twin:
     t: {at: head}
 """
 CAPACITY, COOLING = "bodies.head.capacity", "exposures.head-room.conductance"
-ORIGIN = Origin(("b1", "b2"), "2026-11-21T10:00:00+01:00", True, {"t_K": 0.12345}, "converged after 4 steps")
+ORIGIN = Calibrated(
+    batches=("b1", "b2"), when="2026-11-21T10:00:00+01:00", simulated=True, left_out_rms={"t_K": 0.12345},
+    words="converged after 4 steps",
+)  # fmt: skip
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from data.errors import InputError
 from data.machine import parse_machine
 from twin.calibration.calibrated_file import Update, with_calibrated, with_values
 from twin.compile import compile_network
+from twin.schema import Calibrated
 
 TEXT = (Path(__file__).parents[2] / "machines" / "sample_vmc.yml").read_text()
 
@@ -55,9 +56,9 @@ def test_a_block_style_value_gets_lines_of_its_own() -> None:
 
 
 def test_where_it_came_from_is_written_once() -> None:
-    text = with_calibrated(TEXT, {"batches": ["a", "b"], "when": "at first"})
+    text = with_calibrated(TEXT, Calibrated(batches=("a", "b"), when="at first"))
     assert "  calibrated:\n    batches: [a, b]\n    when: at first\n" in text
-    text = with_calibrated(text, {"batches": ["c"], "when": "again"})
+    text = with_calibrated(text, Calibrated(batches=("c",), when="again"))
     assert text.count("calibrated:") == 1 and "batches: [c]" in text
     assert "\n  surroundings:\n" in text
     parse_machine(text, "again")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from data.arrays import Array
 from data.errors import InputError
 from twin.network import CompiledSurrounding, Law, Network
-from twin.simulation.inputs import Inputs, parameters_of
+from twin.simulation.inputs import Inputs
 
 
 @dataclass(frozen=True)
@@ -113,12 +113,8 @@ def effect_K(law: Law, values: Array, inputs: Inputs, air: Air) -> Array:
         ends = air.ends(port.surrounding)
         degC[role] = ends[..., 0] if along else np.moveaxis(ends, -1, -2)
         rise_K[role] = degC[role] - (degC[role][..., :1] if along else degC[role][..., :1, :1])
-    view = inputs.intervals.view(law, along, degC=degC, rise_K=rise_K)
-    out = np.asarray(law.mechanism.surrounding_K(view, parameters_of(law, values, 2 if along else 3)))
-    n_batches, n_intervals = inputs.valid.shape
-    if along:
-        return np.repeat(np.broadcast_to(out, (len(values), n_batches, n_intervals))[..., None], 2, axis=-1)
-    return np.moveaxis(np.broadcast_to(out, (len(values), n_batches, 2, n_intervals)), 2, 3)
+    out = inputs.intervals.call(law, "surrounding_K", values, along, degC=degC, rise_K=rise_K)
+    return inputs.intervals.ends(out, len(values), along)
 
 
 def _extra(network: Network, values: Array, inputs: Inputs, air: Air) -> Array | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
@@ -14,7 +14,7 @@ from data.arrays import Array, Numeric
 from data.errors import InputError
 from twin.network import Edge, Heat, Law, Network, Port
 from twin.simulation.air import Air, air_of
-from twin.simulation.inputs import STEP, Inputs, along_time, heat_W, parameters_of, reads_time
+from twin.simulation.inputs import STEP, Inputs, along_time, heat_W, reads_time
 from twin.simulation.response import Forcing, Response
 from twin.simulation.schedule import MOST, Drive, Regimes, Schedule, at_tuples, distinct, factor_series, regimes_of
 
@@ -91,20 +91,9 @@ class Balance:
     def driven_W(self, heat: Heat, values: Array | None = None) -> Array:
         """Watts (P or 1, B, M, 2) of a heat that does not depend on temperature, at both ends of every interval."""
         along, values = along_time(heat), self.values if values is None else values
-        views = self.inputs.intervals
-
-        def call(law: Law, effect: str) -> Array:
-            p = parameters_of(law, values, 2 if along else 3)
-            return np.asarray(getattr(law.mechanism, effect)(views.view(law, along), p))
-
-        out = heat_W(heat, call)
-        times = self.inputs.times.get(heat.law.name)
-        if times is not None:
-            out = out * times.reshape(-1, *(1,) * (1 if along else 2))
-        shape = (len(values), *self.inputs.valid.shape)
-        if along:
-            return np.broadcast_to(np.broadcast_to(out, shape)[..., None], (*shape, 2))
-        return np.moveaxis(np.broadcast_to(out, (shape[0], shape[1], 2, shape[2])), 2, 3)
+        intervals = self.inputs.intervals
+        out = heat_W(heat, lambda law, effect: intervals.call(law, effect, values, along))
+        return intervals.ends(intervals.times(heat, out, along), len(values), along)
 
 
 def balance_of(network: Network, values: Array, inputs: Inputs) -> Balance:
@@ -168,9 +157,7 @@ def check_values(network: Network, values: Array) -> None:
 
 
 def _timed(heat: Heat) -> bool:
-    effects: list[tuple[Law, str]] = [(heat.law, "heat_W"), *((f, "factor") for f in heat.factors)]
-    check: Callable[[Law, str], bool] = reads_time
-    return any(check(law, effect) for law, effect in effects)
+    return reads_time(heat.law, "heat_W") or any(reads_time(f, "factor") for f in heat.factors)
 
 
 EVERY = slice(None)
@@ -271,9 +258,7 @@ class HeatSource:
     def _driven(self, law: Law, effect: str) -> Numeric:
         """What a law without ports gives in all intervals, worked out once."""
         if (law.name, effect) not in self._known:
-            view = self.balance.inputs.intervals.view(law, self.along)
-            p = parameters_of(law, self.balance.values, 2 if self.along else 3)
-            out = np.asarray(getattr(law.mechanism, effect)(view, p))
+            out = self.balance.inputs.intervals.call(law, effect, self.balance.values, self.along)
             shape = (1, *self.balance.inputs.valid.shape)
             shape = shape if self.along else (1, shape[1], 2, shape[2])
             self._known[law.name, effect] = np.broadcast_to(out, np.broadcast_shapes(out.shape, shape))
@@ -306,13 +291,9 @@ class HeatSource:
                 return self._driven(law, effect)[..., part]
             pairs = {role: temperature(law, role, port) for role, port in law.ports.items()}
             degC, rise_K = ({r: pair[i] for r, pair in pairs.items()} for i in (0, 1))
-            view = balance.inputs.intervals.view(law, along, part, degC, rise_K)
-            return np.asarray(getattr(law.mechanism, effect)(view, parameters_of(law, values, 2 if along else 3)))
+            return balance.inputs.intervals.call(law, effect, values, along, part, degC, rise_K)
 
-        out = heat_W(self.heat, call)
-        times = balance.inputs.times.get(self.name)
-        if times is not None:
-            out = out * times.reshape(-1, *(1,) * (1 if along else 2))
+        out = balance.inputs.intervals.times(self.heat, heat_W(self.heat, call), along)
         n_sets, n_batches = max(len(values), seen.degC.shape[1]), seen.degC.shape[2]
         if along:
             out = np.broadcast_to(out, (n_sets, n_batches, hi))[..., lo::step]
