@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from data.arrays import Array
 from data.errors import InputError
 from twin.network import CompiledSurrounding, Law, Network
-from twin.simulation.inputs import Inputs
+from twin.simulation.inputs import Inputs, at_borders
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,8 @@ class Air:
 
     def borders(self, s: int, every: int = 1) -> Array:
         """The same at the interval borders ``::every`` (P, B, K): where it jumps, as it was before the jump."""
-
-        def before(ends: Array) -> Array:
-            return np.concatenate([ends[..., :1, 0], ends[..., 1]], axis=-1)[..., ::every]
-
-        return self._sum(s, before(self.recorded_degC[s]), None if self.extra_K is None else before(self.extra_K[:, s]))
+        extra_K = None if self.extra_K is None else at_borders(self.extra_K[:, s])[..., ::every]
+        return self._sum(s, at_borders(self.recorded_degC[s])[..., ::every], extra_K)
 
     def _sum(self, s: int, recorded_degC: Array, extra_K: Array | None) -> Array:
         axes = (slice(None), s, *(None,) * recorded_degC.ndim)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from data.arrays import Array, Numeric
 from data.errors import InputError
 from twin.network import Edge, Heat, Law, Network, Port
 from twin.simulation.air import Air, air_of
-from twin.simulation.inputs import STEP, Inputs, along_time, heat_W, reads_time
+from twin.simulation.inputs import EVERY, STEP, Inputs, along_time, heat_W, reads_time
 from twin.simulation.response import Forcing, Response
 from twin.simulation.schedule import MOST, Drive, Regimes, Schedule, at_tuples, distinct, factor_series, regimes_of
 
@@ -83,10 +83,10 @@ class Balance:
         drive: Drive = kept[key]
         return drive
 
-    def directions(self, heats: Sequence[Heat]) -> Array:
-        """Where heats go, (P, R, J, N), the same in every regime."""
-        rows = np.stack([h.direction(self.values) for h in heats], axis=1)
-        return np.repeat(rows[:, None], self.regimes.count, axis=1)
+    def directions(self, heats: Sequence[Heat | Source]) -> Array:
+        """Where heats or sources go, (P, R, J, N), the same in every regime."""
+        each = [h.direction(self.values) if isinstance(h, Heat) else h.direction for h in heats]
+        return np.repeat(np.stack(each, axis=1)[:, None], self.regimes.count, axis=1)
 
     def driven_W(self, heat: Heat, values: Array | None = None) -> Array:
         """Watts (P or 1, B, M, 2) of a heat that does not depend on temperature, at both ends of every interval."""
@@ -160,9 +160,6 @@ def _timed(heat: Heat) -> bool:
     return reads_time(heat.law, "heat_W") or any(reads_time(f, "factor") for f in heat.factors)
 
 
-EVERY = slice(None)
-
-
 @dataclass(frozen=True)
 class Borders:
     """Temperatures (n, P, B, M + 1) of the places that sources depend on, at the interval borders."""
@@ -173,35 +170,6 @@ class Borders:
         """Of place k at both ends of some intervals, (P, B, 2, m)."""
         row = self.degC[k]
         return np.stack([row[..., :-1][..., part], row[..., 1:][..., part]], axis=-2)
-
-
-class Source(Protocol):
-    """One series of temperature-dependent heat.
-
-    `direction` (P, N) is where a watt goes, `places` the rows of `Borders` that it depends on. One `along` time needs
-    the whole series from the start, and holds during an interval.
-    """
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def direction(self) -> Numeric: ...
-
-    @property
-    def places(self) -> tuple[int, ...]: ...
-
-    @property
-    def along(self) -> bool: ...
-
-    def watts(self, seen: Borders, part: slice, values: Numeric | None = None) -> Numeric:
-        """W (P, B, 2, m) in some intervals; other parameter values (P, n) for a derivative."""
-
-    def slopes(self, seen: Borders, part: slice) -> dict[int, Numeric]:
-        """Derivative by the temperature of each place, W/K (P, B, 2, m)."""
-
-    def surrounding_slopes(self, seen: Borders, part: slice) -> dict[int, Numeric]:
-        """The same by the temperature of each surrounding that it depends on."""
 
 
 class Places:
@@ -221,7 +189,11 @@ class Places:
 
 @dataclass(frozen=True)
 class HeatSource:
-    """A heat whose law, or a law that multiplies it, has ports."""
+    """A heat whose law, or a law that multiplies it, has ports: one series of temperature-dependent heat.
+
+    `direction` (P, N) is where a watt goes, `places` the rows of `Borders` that it depends on. One `along` time needs
+    the whole series from the start, and holds during an interval.
+    """
 
     balance: Balance
     heat: Heat
@@ -245,12 +217,15 @@ class HeatSource:
         return along_time(self.heat)
 
     def watts(self, seen: Borders, part: slice, values: Numeric | None = None) -> Numeric:
+        """W (P, B, 2, m) in some intervals; other parameter values (P, n) for a derivative."""
         return self._evaluate(seen, part, values=values)
 
     def slopes(self, seen: Borders, part: slice) -> dict[int, Numeric]:
+        """Derivative by the temperature of each place, W/K (P, B, 2, m)."""
         return {k: self._evaluate(seen, part, place=k).imag / STEP for k in self.places}
 
     def surrounding_slopes(self, seen: Borders, part: slice) -> dict[int, Numeric]:
+        """The same by the temperature of each surrounding that it depends on."""
         laws = (self.heat.law, *self.heat.factors)
         which = dict.fromkeys(p.surrounding for law in laws for p in law.ports.values() if p.cells is None)
         return {s: self._evaluate(seen, part, surrounding=s).imag / STEP for s in which}
@@ -303,15 +278,15 @@ class HeatSource:
 
 @dataclass(frozen=True)
 class ExchangeSource:
-    """What the conductance of an edge is, in every interval, beyond the constant that its regime has."""
+    """What the conductance of an edge is, in every interval, beyond the constant that its regime has.
+
+    Methods as of `HeatSource`.
+    """
 
     balance: Balance
     edge: Edge
     place: int
-
-    @property
-    def along(self) -> bool:
-        return False
+    along: ClassVar[bool] = False
 
     @property
     def name(self) -> str:
@@ -352,6 +327,9 @@ class ExchangeSource:
 
     def _both(self, part: slice) -> Numeric:
         return np.repeat(self.excess_W_per_K[..., None, part], 2, axis=-2)
+
+
+Source = HeatSource | ExchangeSource
 
 
 def sources_of(balance: Balance, places: Places) -> tuple[list[Source], list[HeatSource]]:

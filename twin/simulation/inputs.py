@@ -95,6 +95,11 @@ def parameters_of(law: Law, values: Numeric, axes: int) -> dict[str, Numeric]:
     return {name: values[:, j].reshape(-1, *(1,) * axes) for name, j in law.parameters.items()}
 
 
+def at_borders(ends: Numeric) -> Numeric:
+    """Values at both ends of every interval (…, M, 2) at the borders (…, M + 1): where they jump, before the jump."""
+    return np.concatenate([ends[..., :1, 0], ends[..., 1]], axis=-1)
+
+
 def stepped(values: Numeric, j: int) -> Numeric:
     """Values (P, n) with parameter j a complex step ahead."""
     out = values.astype(complex)
@@ -188,12 +193,6 @@ class Inputs:
     def valid(self) -> NDArray[np.bool_]:
         """Which intervals are no padding, (B, M)."""
         return np.asarray(np.arange(self.time_s.shape[1] - 1) < self.n_intervals[:, None])
-
-    @property
-    def valid_rows(self) -> NDArray[np.bool_]:
-        """Which rows of the recordings are no padding, (B, K)."""
-        rows = np.arange((self.time_s.shape[1] - 1) // self.every + 1)
-        return np.asarray(rows * self.every <= self.n_intervals[:, None])
 
     def refined(self, factor: int) -> Inputs:
         """Every interval cut into equal parts: drivers held, surroundings linear; the recording's rows stay."""
