@@ -37,8 +37,8 @@ from pipelines.inputs import INPUTS, Inputs
 from pipelines.recordings import Gathered, check_recordings, gather_batches
 from pipelines.settings import Settings, home
 from reports.diagnosis.first_screen import Continued
-from twin.calibration.calibrated_file import Origin
 from twin.compile import compile_network
+from twin.schema import Calibrated
 
 REPORT, PLAN, MACHINE, FINDINGS = "report.html", "next_run.yml", "machine.yml", "findings.json"
 FILES = (REPORT, PLAN, MACHINE, INPUTS, FINDINGS)  # the last one says that the others are complete
@@ -245,7 +245,10 @@ def new_machine_file(d: Diagnosis, text: str, where: str, when: datetime) -> str
     remarks = f"diagnosis: {f.verdict.replace('_', ' ')}"
     if rms:
         remarks += f"; left_out_rms: over all rows of {f.fit.batches} left-out batches"
-    origin = Origin(f.batches, when.isoformat(timespec="seconds"), d.simulated, rms, remarks)
+    origin = Calibrated(
+        batches=f.batches, when=when.isoformat(timespec="seconds"), simulated=d.simulated, left_out_rms=rms,
+        words=remarks,
+    )  # fmt: skip
     return diagnosed_text(text, where, d.values, d.intervals, d.added, d.notes, origin)
 
 

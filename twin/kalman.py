@@ -81,20 +81,6 @@ class _Linear:
         return np.asarray(self.start @ own @ self.start.swapaxes(-1, -2))
 
 
-def filtered(
-    network: Network, values: Array, inputs: Inputs, readings: Array, doubt: Doubt, start_degC: Array | None = None
-) -> Filtered:
-    """Temperatures and errors of B batches at parameter values (n,), corrected by readings (B, K, n_sensors), degC.
-
-    Sensors in the network's order; NaN is no reading. The rows are the recording's. `start_degC` (B, N) is the mean of
-    the start, default settled with the surroundings.
-
-    Raises:
-        InputError: readings or a covariance of another shape; a sensor whose law remembers more than a lag.
-    """
-    return filtered_each(network, values, inputs, readings, [doubt], start_degC)[0]
-
-
 def filtered_each(
     network: Network,
     values: Array,
@@ -104,9 +90,15 @@ def filtered_each(
     start_degC: Array | None = None,
     thin: int = 1,
 ) -> list[Filtered]:
-    """`filtered` under each of several uncertainties, which share the simulation and its linearisation.
+    """Temperatures and errors of B batches at parameter values (n,), corrected by readings (B, K, n_sensors), degC.
 
-    Only every `thin`-th row's readings are used, from the first on; the rows behind it keep its corrections.
+    Under each of several uncertainties, which share the simulation and its linearisation. Sensors in the network's
+    order; NaN is no reading. The rows are the recording's; only every `thin`-th row's readings are used, from the
+    first on, and the rows behind it keep its corrections. `start_degC` (B, N) is the mean of the start, default settled
+    with the surroundings.
+
+    Raises:
+        InputError: readings or a covariance of another shape; a sensor whose law remembers more than a lag.
     """
     for doubt in doubts:
         _check(network, inputs, readings, doubt)

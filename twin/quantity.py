@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
@@ -245,6 +245,3 @@ class Monomial:
 def values_of(parameters: Sequence[Parameter]) -> Array:
     """The parameters' values (n,), in their units."""
     return np.array([p.value for p in parameters], dtype=np.float64)
-
-
-Given = Mapping[str, Value]

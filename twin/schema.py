@@ -177,9 +177,9 @@ class Calibrated(Section):
     """Where the values come from, written by `thermodrift calibrate`."""
 
     batches: tuple[str, ...]
-    when: str
+    when: str  # ISO date and time
     simulated: bool = False
-    left_out_rms: Mapping[str, float] = {}
+    left_out_rms: Mapping[str, float] = {}  # by channel in its unit; empty where no batch was left out
     words: str = ""
 
 
@@ -230,7 +230,7 @@ def _with_ends(key: Any, given: Any, ends: tuple[str, ...]) -> Any:
 
 
 def twin_part(machine: Machine, where: str = "") -> TwinPart:
-    """The machine file's twin part, checked for form; `twin.compiling.checks` and `twin.network` check its sense.
+    """The machine file's twin part, checked for form; `twin.compile` checks its sense.
 
     Raises:
         InputError: no twin part, an unknown key (with the closest), a wrong value; one line with file and key.

@@ -17,12 +17,12 @@ from data.machine import Machine, parse_machine
 from data.yaml_edit import YamlText
 from diagnosis.contracts import PART_GROUPS, Fitted, with_parts, with_value
 from diagnosis.export.yaml_text import DIGITS, part_plain, plain, tidied
-from twin.calibration.calibrated_file import Origin, Update, held_steps, kept, put_values, with_calibrated
+from twin.calibration.calibrated_file import Update, held_steps, kept, put_values, with_calibrated
 from twin.calibration.identifiability import Interval
 from twin.compile import compile_network, own_paths
 from twin.network import Network
 from twin.quantity import Value
-from twin.schema import MechanismPart, TwinPart, twin_part
+from twin.schema import Calibrated, MechanismPart, TwinPart, twin_part
 
 PRIOR_SAME = 1e-4  # relative: five digits are kept
 SAME = 1e-9  # relative: what is read back against what was to be written
@@ -36,7 +36,7 @@ def diagnosed_text(
     intervals: Iterable[Interval],
     added: Mapping[str, BaseModel],
     notes: Mapping[str, str],
-    origin: Origin | None = None,
+    origin: Calibrated | None = None,
 ) -> str:
     """The text of a machine file with new values and new parts of its twin.
 
@@ -70,7 +70,7 @@ def diagnosed_text(
         document.comment(_held_steps(document, path), note)
     new = str(document)
     if origin is not None:
-        new = with_calibrated(new, origin.rows)
+        new = with_calibrated(new, origin)
     _check(new, machine, part, network, updates, own, where)
     return new
 

@@ -62,11 +62,15 @@ def write_calibrated(found: Calibration, text: str, machine_file: Path, out: Pat
         InputError: `out` exists and must not be overwritten.
         WorkError: it cannot be written; what stood there is unchanged.
     """
-    from twin.calibration.calibrated_file import Origin, calibrated_text, write_file
+    from twin.calibration.calibrated_file import calibrated_text, write_file
     from twin.compile import compile_network
+    from twin.schema import Calibrated
 
     when = datetime.now().astimezone().isoformat(timespec="seconds")
-    origin = Origin(found.batches, when, found.simulated, _left_out_rms(found), _remarks(found))
+    origin = Calibrated(
+        batches=found.batches, when=when, simulated=found.simulated, left_out_rms=_left_out_rms(found),
+        words=_remarks(found),
+    )  # fmt: skip
     network = compile_network(found.machine, f"machine file {machine_file}")
     new = calibrated_text(text, network, found.values, found.intervals90, origin, f"machine file {out}")
     write_file(out, new, machine_file, overwrite)

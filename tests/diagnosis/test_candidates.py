@@ -19,7 +19,7 @@ from diagnosis.candidates.library import HINTS, candidates, equipment_named, lin
 from diagnosis.contracts import Candidate, Where
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import proposed
-from diagnosis.screening.signatures import differences
+from diagnosis.screening.signatures import asleep, differences
 from diagnosis.search.search import search
 from tests.diagnosis.small_cases import equipped, fitted, four_bodies, runs, two_bodies
 from twin.compile import compile_network
@@ -385,3 +385,29 @@ def test_a_mechanism_added_at_run_time_is_proposed_and_found(registry: Registry)
     assert found.best is not None and found.best.candidate.name == "morning_pump_head"
     values = dict(zip((p.name for p in done.final.problem.network.parameters), done.final.values, strict=True))
     assert values["mechanisms.morning_pump_head.heat"] == pytest.approx(120.0, rel=0.05)
+
+
+def board(range_: list[float] | None) -> Machine:
+    level: dict[str, Any] = {"role": "driver", "unit": "%"} | ({"range": range_} if range_ else {})
+    return Machine(
+        machine="board",
+        channels={
+            "one": level, "other": level,
+            "t": {"role": "temperature", "unit": "degC", "resolution": 0.1},
+            "room": {"role": "ambient", "unit": "degC"},
+        },
+        twin={
+            "surroundings": {"room": {"channel": "room"}}, "bodies": {"plate": {"capacity": "3 J/K"}},
+            "exposures": {"plate-room": "12 mW/K"}, "sensors": {"t": {"at": "plate"}},
+            "mechanisms": {"heat": {"law": "electrical_heat", "drivers": {"level": "one"}, "into": "plate"}},
+        },
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("range_, level", [([0.0, 100.0], 100.0), (None, 1.0)])
+def test_a_sag_is_stated_at_the_other_ones_full_level(range_: list[float] | None, level: float) -> None:
+    machine = board(range_)
+    part = twin_part(machine)
+    sags = [c for c in candidates(machine, part, ["supply_sag"]) if c.part and c.part.drivers == {"other": "other"}]
+    network = asleep(machine, part, sags).network
+    assert network.values[network.index("mechanisms.supply_sag_heat_other.rated")] == level

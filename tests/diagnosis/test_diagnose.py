@@ -242,22 +242,16 @@ def test_two_runs_are_cut_and_nothing_is_too_sure() -> None:
 # What cannot be used
 
 
-def test_a_run_of_another_machine() -> None:
+def test_runs_that_cannot_be_used() -> None:
     given = runs(two_bodies(), count=4)
-    given[2] = replace(given[2], machine="lathe")
-    with pytest.raises(InputError, match="batch b02: is of machine 'lathe', expected 'two_bodies'; leave it out"):
-        diagnose(two_bodies(), given)
-
-
-def test_the_same_run_twice() -> None:
-    given = runs(two_bodies(), count=4)
-    with pytest.raises(InputError, match="batch b01: given 2 times; give it once"):
-        diagnose(two_bodies(), [*given, given[1]])
-
-
-def test_no_runs_at_all() -> None:
-    with pytest.raises(InputError, match="machine two_bodies: no batches to diagnose; give recordings"):
-        diagnose(two_bodies(), [])
+    strange = replace(given[2], machine="lathe")
+    for batches, words in (
+        ([*given[:2], strange], "batch b02: is of machine 'lathe', expected 'two_bodies'; leave it out"),
+        ([*given, given[1]], "batch b01: given 2 times; give it once"),
+        ([], "machine two_bodies: no batches to diagnose; give recordings"),
+    ):
+        with pytest.raises(InputError, match=words):
+            diagnose(two_bodies(), batches)
 
 
 def test_without_a_twin_part_temperatures_are_needed() -> None:

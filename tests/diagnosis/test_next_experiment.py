@@ -62,6 +62,10 @@ def tied(bare: bool = False) -> dict[str, Fitted]:
     return {"air": fitted(air, shown), "loss": fitted(loss, shown)}
 
 
+def runs_of(of: Fitted) -> list[Run]:
+    return list(menu(of.machine, of.batches, ["rpm"]))
+
+
 @cache
 def proposal() -> Proposal:
     return next_experiment(tied())
@@ -98,13 +102,11 @@ def test_a_run_is_chosen_that_the_recordings_were_not() -> None:
     alternatives, chosen = tied(), proposal()
     assert chosen.separates == ("air", "loss") and chosen.tied == () and chosen.sensor is None
     assert chosen.nats >= POLICY.settling_nats and chosen.nats_per_hour == pytest.approx(chosen.nats / chosen.hours)
-    first = menu(alternatives["air"].machine, alternatives["air"].batches, ["rpm"])[0]
+    first = runs_of(alternatives["air"])[0]
     like_before = foreseen(list(alternatives.values()), [again(first, 4.0, 3000.0)]).nats[..., 0]
     by_words = chosen.table.set_index("run")["nats"]
     assert like_before.max() < 0.1 * by_words.min()  # another one at that speed tells next to nothing
-    run = next(
-        r for r in menu(alternatives["air"].machine, alternatives["air"].batches, ["rpm"]) if r.label == chosen.label
-    )
+    run = next(r for r in runs_of(alternatives["air"]) if r.label == chosen.label)
     both = foreseen(list(alternatives.values()), [run]).nats[..., 0]
     assert chosen.nats == pytest.approx(min(both[0, 1], both[1, 0])) and both[0, 1] > 2 * both[1, 0]
     assert list(chosen.table.columns) == list(COLUMNS) and by_words.is_monotonic_decreasing
@@ -123,9 +125,7 @@ def test_the_run_carried_out_settles_it(tmp_path: Path, truth: str, other: str) 
     batch = carried_out(load_run_plan(path, alternatives[truth].machine), alternatives[truth], seed=3)
     before = lead_nats(alternatives[truth], alternatives[other])
     after = lead_nats(alternatives[truth], alternatives[other], [batch])
-    run = next(
-        r for r in menu(alternatives["air"].machine, alternatives["air"].batches, ["rpm"]) if r.label == chosen.label
-    )
+    run = next(r for r in runs_of(alternatives["air"]) if r.label == chosen.label)
     told = foreseen([alternatives[truth], alternatives[other]], [run]).nats[0, 1, 0]
     assert after - before > POLICY.settling_nats
     # linear foresight: a parameter that must move far costs less or more than its first step says
@@ -136,7 +136,7 @@ def test_the_run_carried_out_settles_it(tmp_path: Path, truth: str, other: str) 
 def test_foreseen_is_the_least_squares_after_a_refit(bare: bool, number: int) -> None:
     """The same number from one dense system: data of one rival, parameters and nuisances of the other with priors."""
     alternatives = list(tied(bare).values())
-    run = menu(alternatives[0].machine, alternatives[0].batches, ["rpm"])[number]
+    run = runs_of(alternatives[0])[number]
     truth, other = (AlternativeModel.of(f, [run], ()) for f in alternatives)
     weight = np.min([f.noise.weight for f in alternatives], axis=0)
 
@@ -159,9 +159,7 @@ def test_foreseen_is_the_least_squares_after_a_refit(bare: bool, number: int) ->
 
 def test_a_rival_begins_where_the_sensors_say() -> None:
     alternatives = list(tied().values())
-    model = AlternativeModel.of(
-        alternatives[0], menu(alternatives[0].machine, alternatives[0].batches, ["rpm"])[:2], ()
-    )
+    model = AlternativeModel.of(alternatives[0], runs_of(alternatives[0])[:2], ())
     sensor = alternatives[0].problem.network.readings[0]
     warmer = {n: v + 1.5 for n, v in model.first.items()}
     for r in range(2):
@@ -195,10 +193,7 @@ def test_one_more_sensor_where_no_run_tells_by_itself() -> None:
 def test_what_a_claim_lacks_decides_how_much_a_run_must_bring() -> None:
     alternatives, little = tied(), proposal()
     much = next_experiment(alternatives, lacking_nats={"loss": 1e6})  # no run brings it: the most per hour of machine
-    taken_h = {
-        r.label: r.hours + sum(s.seconds for s in r.before) / 3600
-        for r in menu(alternatives["air"].machine, alternatives["air"].batches, ["rpm"])
-    }
+    taken_h = {r.label: r.hours + sum(s.seconds for s in r.before) / 3600 for r in runs_of(alternatives["air"])}
     rate = little.table["nats"] / little.table["run"].map(taken_h)
     assert much.label == little.table["run"][rate.argmax()]
     enough = next_experiment(alternatives, lacking_nats={"loss": little.table["nats"].max() - 1e-6})
@@ -322,7 +317,7 @@ def test_without_a_spindle_and_without_a_room() -> None:
 
 def test_a_hot_run_begins_hot() -> None:
     rival = tied()["air"]
-    runs = menu(rival.machine, rival.batches, ["rpm"])
+    runs = runs_of(rival)
     cool = next(r for r in runs if r.label.startswith("a cool-down"))
     room = cool.surroundings["room"][0][1]
     hot, cold = begun(rival, cool), begun(rival, runs[0])

@@ -1,4 +1,4 @@
-"""The calibrated machine file: read back before it replaces anything, and nothing lost on any failure."""
+"""The calibrated machine file: the old text with new values, read back before it replaces anything."""
 
 from __future__ import annotations
 
@@ -8,11 +8,18 @@ import pytest
 
 from data.errors import InputError, WorkError
 from data.machine import load_machine, parse_machine
-from twin.calibration.calibrated_file import Origin, calibrated_text, check_writable, write_file
+from twin.calibration.calibrated_file import (
+    Update,
+    calibrated_text,
+    check_writable,
+    with_calibrated,
+    with_values,
+    write_file,
+)
 from twin.calibration.identifiability import Interval
 from twin.compile import compile_network
 from twin.network import Network
-from twin.schema import twin_part
+from twin.schema import Calibrated, twin_part
 
 TEXT = """# by hand
 machine: two
@@ -29,8 +36,12 @@ twin:
   sensors:
     t: {at: head}
 """
+SAMPLE = (Path(__file__).parents[2] / "machines" / "sample_vmc.yml").read_text()
 CAPACITY, COOLING = "bodies.head.capacity", "exposures.head-room.conductance"
-ORIGIN = Origin(("b1", "b2"), "2026-11-21T10:00:00+01:00", True, {"t_K": 0.12345}, "converged after 4 steps")
+ORIGIN = Calibrated(
+    batches=("b1", "b2"), when="2026-11-21T10:00:00+01:00", simulated=True, left_out_rms={"t_K": 0.12345},
+    words="converged after 4 steps",
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -128,3 +139,55 @@ def test_what_cannot_be_written_is_told_before_the_work(source: Path) -> None:
     source.write_text(hidden, encoding="utf-8")
     with pytest.raises(InputError, match=r"twin.exposures.head-room.conductance does not stand in the file as a value"):
         check_writable(source, network_of())
+
+
+def test_every_free_parameter_of_the_sample_machine_can_be_written_and_read_back(sample: Network) -> None:
+    free = [sample.parameters[k] for k in sample.free]
+    updates = {
+        p.name: Update(p, p.value * 1.25, (p.value * 1.1, p.value * 1.4)) for p in free if p.value * 1.25 < p.high
+    }
+    text = with_values(SAMPLE, updates, "sample")
+    again = compile_network(parse_machine(text, "calibrated"))
+    for old in free:
+        new = again.parameters[again.index(old.name)]
+        assert new.value == pytest.approx(old.value * 1.25, rel=1e-4)
+        assert new.prior_value == pytest.approx(old.value, rel=1e-4)
+        assert (new.spread, new.free, new.unit) == (old.spread, True, old.unit)
+
+
+def test_comments_and_other_lines_stay(sample: Network) -> None:
+    p = sample.parameters[sample.index("links.shaft-front.conductance")]
+    text = with_values(SAMPLE, {p.name: Update(p, 12.3456789, (11.0, 13.5))}, "sample")
+    old, new = SAMPLE.splitlines(), text.splitlines()
+    assert len(old) == len(new)
+    changed = [(a, b) for a, b in zip(old, new, strict=True) if a != b]
+    assert changed == [
+        (
+            "    shaft-front: {value: 14 W/K, spread: 0.5}",
+            "    shaft-front: {value: 12.346 W/K, spread: 0.5, prior: 14 W/K, interval90: [11, 13.5]}",
+        )
+    ]
+    twice = with_values(text, {p.name: Update(p, 12.5, (11.0, 13.5))}, "sample")
+    assert "shaft-front: {value: 12.5 W/K, spread: 0.5, prior: 14 W/K, interval90: [11, 13.5]}" in twice
+
+
+def test_a_block_style_value_gets_lines_of_its_own(sample: Network) -> None:
+    text = "twin:\n  links:\n    a-b:\n      conductance:\n        value: 3 W/K  # by hand\n        spread: 0.5\n"
+    p = sample.parameters[sample.index("links.shaft-front.conductance")]
+    new = with_values(text, {"links.a-b.conductance": Update(p, 4.0, (3.0, 5.0))}, "m")
+    assert "        value: 4 W/K  # by hand\n        spread: 0.5\n        prior: 14 W/K\n" in new
+
+
+def test_where_it_came_from_is_written_once() -> None:
+    text = with_calibrated(SAMPLE, Calibrated(batches=("a", "b"), when="at first"))
+    assert "  calibrated:\n    batches: [a, b]\n    when: at first\n" in text
+    text = with_calibrated(text, Calibrated(batches=("c",), when="again"))
+    assert text.count("calibrated:") == 1 and "batches: [c]" in text
+    assert "\n  surroundings:\n" in text
+    parse_machine(text, "again")
+
+
+def test_a_parameter_that_is_not_in_the_file_is_told(sample: Network) -> None:
+    p = sample.parameters[0]
+    with pytest.raises(InputError, match=r"m.yml: twin.links.x.conductance does not stand in the file"):
+        with_values(SAMPLE, {"links.x.conductance": Update(p, 1.0, (0.5, 2.0))}, "m.yml")

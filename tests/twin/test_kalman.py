@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from data.errors import InputError
 from tests.twin.machines import machine
 from twin.compile import compile_network
-from twin.kalman import Doubt, filtered, filtered_each
+from twin.kalman import Doubt, Filtered, filtered_each
 from twin.network import Network
 from twin.simulation import simulate
 from twin.simulation.inputs import Inputs
@@ -37,6 +37,10 @@ def two_bodies(**changes: object) -> Network:
     return compile_network(
         machine(**{"sensors__t_shaft__noise": "0.05 K", "sensors__t_head__noise": "0.05 K"} | changes)
     )
+
+
+def filtered(network: Network, given: Inputs, readings: np.ndarray, doubt: Doubt, *start: np.ndarray) -> Filtered:
+    return filtered_each(network, network.values, given, readings, [doubt], *start)[0]
 
 
 def with_grease() -> Network:
@@ -122,7 +126,7 @@ def test_is_the_textbook_filter_on_two_bodies_with_missing_rows(lag_s, atol_um):
     readings[0, rng.random(ROWS) < 0.3, 0] = np.nan
     readings[0, 50:70] = np.nan
     start = np.array([20.0, 21.0])
-    got = filtered(network, network.values, given, readings, doubt, start[None])
+    got = filtered(network, given, readings, doubt, start[None])
     z, sd = textbook(network, readings[0], start, doubt, lag_s)
     np.testing.assert_allclose(got.errors[0, :, 0], z, atol=atol_um)
     np.testing.assert_allclose(got.error_sd[0, :, 0], sd, rtol=1e-3, atol=1e-3)
@@ -131,7 +135,7 @@ def test_is_the_textbook_filter_on_two_bodies_with_missing_rows(lag_s, atol_um):
 def test_without_readings_it_runs_free():
     network, given = with_grease(), inputs()
     start = np.array([[20.0, 20.0]])
-    got = filtered(network, network.values, given, no_readings(network, given), Doubt(np.eye(2)), start)
+    got = filtered(network, given, no_readings(network, given), Doubt(np.eye(2)), start)
     free = simulate(network, network.values, given, start[None])
     np.testing.assert_allclose(got.errors, free.errors[0], atol=1e-9)
     assert np.isnan(got.innovation).all() and got.log_likelihood[0] == 0.0
@@ -144,7 +148,7 @@ def test_innovation_is_white_and_of_unit_variance_where_model_and_noise_are_righ
     start_K2 = np.array([[4.0, 1.0], [1.0, 2.0]])
     start = 20.0 + rng.multivariate_normal([0, 0], start_K2, size=12)
     readings, _ = truth(network, given, start, seed=8)
-    got = filtered(network, network.values, given, readings, Doubt(start_K2, 0.0, 0.0), np.full((12, 2), 20.0))
+    got = filtered(network, given, readings, Doubt(start_K2, 0.0, 0.0), np.full((12, 2), 20.0))
     for j in range(2):
         news = got.innovation[:, :, j]
         n = news.size
@@ -161,7 +165,7 @@ def test_beats_free_running_from_a_wrong_start_and_its_sd_tells_how_well():
     start = 20.0 + rng.multivariate_normal([0, 0], start_K2, size=20)
     readings, errors = truth(network, given, start, seed=6)
     guess = np.full((20, 2), 20.0)
-    got = filtered(network, network.values, given, readings, Doubt(start_K2, 0.0, 0.0), guess)
+    got = filtered(network, given, readings, Doubt(start_K2, 0.0, 0.0), guess)
     free = simulate(network, network.values, given, guess[None]).errors[0]
     wrong, right = errors - free, errors - got.errors
     assert np.sqrt(np.mean(right**2)) < 0.1 * np.sqrt(np.mean(wrong**2))
@@ -175,7 +179,7 @@ def test_finds_a_heat_that_is_stronger_than_the_file_says():
     stronger[network.index("mechanisms.belt.power")] *= 1.25
     start = np.array([[20.0, 20.0]])
     readings = simulate(network, stronger, given, start[None]).readings[0]
-    got = filtered(network, network.values, given, readings, Doubt(np.eye(2) * 0.01, 0.2, 1.0), start)
+    got = filtered(network, given, readings, Doubt(np.eye(2) * 0.01, 0.2, 1.0), start)
     assert got.heat_factor[0, -1, 0] == pytest.approx(0.25, abs=0.03)
 
 
@@ -185,7 +189,7 @@ def test_a_row_knows_nothing_of_later_readings():
     changed = readings.copy()
     changed[:, 60:] += 5.0
     doubt, start = Doubt(np.eye(2)), np.array([[20.0, 20.0]])
-    one, other = (filtered(network, network.values, given, r, doubt, start) for r in (readings, changed))
+    one, other = (filtered(network, given, r, doubt, start) for r in (readings, changed))
     np.testing.assert_array_equal(one.errors[:, :60], other.errors[:, :60])
     assert np.abs(one.errors[:, 60:] - other.errors[:, 60:]).max() > 1.0
 
@@ -195,8 +199,8 @@ def test_batches_do_not_touch_each_other_and_the_shorter_one_ends_early():
     both = inputs(batches=2, lengths=(ROWS - 1, 70))
     readings = np.concatenate([truth(network, inputs(), np.array([[s, s]]), seed=s)[0] for s in (21, 24)])
     doubt = Doubt(np.eye(2))
-    got = filtered(network, network.values, both, readings, doubt)
-    alone = filtered(network, network.values, inputs(), readings[1:], doubt)
+    got = filtered(network, both, readings, doubt)
+    alone = filtered(network, inputs(), readings[1:], doubt)
     np.testing.assert_allclose(got.errors[1, :71], alone.errors[0, :71], atol=2e-3)
     assert np.isnan(got.innovation[1, 71:]).all() and np.isfinite(got.innovation[0]).all()
 
@@ -205,7 +209,7 @@ def test_substeps_change_next_to_nothing():
     network, given = with_grease(), inputs()
     readings, _ = truth(network, given, np.array([[22.0, 21.0]]))
     doubt = Doubt(np.eye(2))
-    one, finer = (filtered(network, network.values, i, readings, doubt) for i in (given, given.refined(4)))
+    one, finer = (filtered(network, i, readings, doubt) for i in (given, given.refined(4)))
     np.testing.assert_allclose(one.errors, finer.errors, atol=0.05)
 
 
@@ -217,7 +221,7 @@ def test_a_body_of_several_cells_has_one_noise_and_its_sensor_still_helps():
     assert n == 4
     readings, errors = truth(network, given, np.full((1, n), 23.0))
     doubt = Doubt(np.full((n, n), 9.0), 0.0, 0.0)  # all of it starts warmer or colder alike
-    got = filtered(network, network.values, given, readings, doubt, np.full((1, n), 20.0))
+    got = filtered(network, given, readings, doubt, np.full((1, n), 20.0))
     free = simulate(network, network.values, given, np.full((1, 1, n), 20.0)).errors[0]
     assert np.abs(got.errors - errors).max() < 0.3 * np.abs(free - errors).max()
 
@@ -226,15 +230,15 @@ def test_mistakes_are_told():
     network, given = two_bodies(), inputs()
     good = no_readings(network, given)
     with pytest.raises(InputError, match=r"readings have shape \(1, 3, 2\), expected .* = \(1, 121, 2\)"):
-        filtered(network, network.values, given, good[:, :3], Doubt(np.eye(2)))
+        filtered(network, given, good[:, :3], Doubt(np.eye(2)))
     with pytest.raises(InputError, match=r"covariance has shape \(3, 3\), expected \(2, 2\)"):
-        filtered(network, network.values, given, good, Doubt(np.eye(3)))
+        filtered(network, given, good, Doubt(np.eye(3)))
     with pytest.raises(InputError, match="heat_W is -1, expected 0 or more"):
-        filtered(network, network.values, given, good, Doubt(np.eye(2), heat_W=-1.0))
+        filtered(network, given, good, Doubt(np.eye(2), heat_W=-1.0))
     stuck = two_bodies(mechanisms__stuck={"law": "sensor_stuck", "acts_on": "t_head"})
     readings = np.full(good.shape, 20.0)
     with pytest.raises(InputError, match="sensor 't_head' has stuck, which remembers more than one lag"):
-        filtered(stuck, stuck.values, given, readings, Doubt(np.eye(2)))
+        filtered(stuck, given, readings, Doubt(np.eye(2)))
 
 
 def test_thinned_readings_give_a_filter_of_longer_steps_whose_corrections_hold_in_between():
@@ -245,7 +249,7 @@ def test_thinned_readings_give_a_filter_of_longer_steps_whose_corrections_hold_i
     few = np.full_like(readings, np.nan)
     few[:, ::3] = readings[:, ::3]
     doubt = Doubt(np.eye(2), 0.1, 5.0)
-    whole = filtered(network, network.values, given, few, doubt, start)
+    whole = filtered(network, given, few, doubt, start)
     one, loud = filtered_each(network, network.values, given, readings, [doubt, Doubt(np.eye(2), 0.1, 50.0)], start, 3)
     np.testing.assert_allclose(one.cells_degC[:, ::3], whole.cells_degC[:, ::3], atol=0.05)
     assert np.isnan(one.innovation[:, 1::3]).all() and np.isfinite(one.innovation[:, 3::3, 0]).all()

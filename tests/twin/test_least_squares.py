@@ -6,6 +6,8 @@ from toy_problems import ToyProblem, decay, linear, unknowns
 
 import twin.calibration.arrow
 from data.errors import InputError, WorkError
+from twin.calibration.arrow import assemble
+from twin.calibration.fit_problem import Block
 from twin.calibration.identifiability import intervals90
 from twin.calibration.least_squares import FitOptions, Unknown, fit
 
@@ -396,3 +398,27 @@ def test_a_smooth_misfit_at_the_priors_does_not_pass_for_noise():
     found = fit(ToyProblem(given, [measured], model), FitOptions(reweight=True))
     assert found.converged
     np.testing.assert_allclose(found.x, truth, atol=0.02)
+
+
+@pytest.mark.parametrize("damping", [0.0, 1.0, 1e4, 1e10])
+@pytest.mark.parametrize("share", [1.0, 0.3, 1e-6])
+def test_a_step_falls_by_what_it_promises_however_little_of_the_nuisances_moves(damping: float, share: float) -> None:
+    rng = np.random.default_rng(5)
+    blocks = [
+        Block(f"b{k}", 30 * rng.standard_normal(20), rng.standard_normal((20, 3)), np.zeros((20, 2)), np.zeros(20, int))
+        for k in range(2)
+    ]
+    for block in blocks:  # nuisances that a parameter imitates, far from their optimum
+        block.nuisance[:] = block.jacobian[:, :2] + 0.05 * rng.standard_normal((20, 2))
+    nuisance, z = [np.array([40.0, -30.0]), np.array([-20.0, 50.0])], np.zeros(3)
+    arrow, free = assemble(blocks, nuisance, z, unknowns(3), np.ones(1)), np.full(3, np.inf)
+
+    def cost(dz: np.ndarray, moves: list[np.ndarray]) -> float:
+        left = [b.residual - b.jacobian @ dz - b.nuisance @ m for b, m in zip(blocks, moves, strict=True)]
+        prior = float(dz @ dz) + sum(float((n + m) @ (n + m)) for n, m in zip(nuisance, moves, strict=True))
+        return prior + sum(float(r @ r) for r in left)
+
+    dz = arrow.step(damping, -free, free)
+    fall = cost(z, [np.zeros(2)] * 2) - cost(dz, [c.step(dz, share) for c in arrow.corners])
+    assert fall > 0
+    assert arrow.gain(dz, share) == pytest.approx(fall, rel=1e-3, abs=1e-6 * cost(z, [np.zeros(2)] * 2))

@@ -44,7 +44,7 @@ def test_two_bodies_even_out_with_the_reduced_capacity() -> None:
     assert modes.rate_per_s[0, 0] == pytest.approx([0.0, 12.0 * (1 / 2e3 + 1 / 5e3)], rel=1e-14)
     assert modes.rate_per_s[0, 0, 0] == 0.0  # exactly: a closed network keeps its energy
     assert modes.time_constants_s()[0, 0, 0] == np.inf
-    assert modes.time_constants_s(0)[0, 1] == pytest.approx(1 / (12.0 * (1 / 2e3 + 1 / 5e3)))
+    assert modes.time_constants_s()[0, 0, 1] == pytest.approx(1 / (12.0 * (1 / 2e3 + 1 / 5e3)))
 
 
 def test_an_insulated_bar_has_the_rates_of_a_chain() -> None:

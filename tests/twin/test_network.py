@@ -3,26 +3,18 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
 from data.errors import InputError
-from data.machine import load_machine, parse_machine
+from data.machine import parse_machine
 from plants.sample import sample_machine as truth
 from plants.sample.thermal_machine import ROTATING_GAIN
 from tests.twin.machines import TWO_BODIES, machine
 from twin.compile import compile_network
 from twin.network import Network
-
-SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
-
-
-@pytest.fixture(scope="module")
-def sample() -> Network:
-    return compile_network(load_machine(SAMPLE))
 
 
 def test_the_sample_machine_file_is_the_sample_machine(sample: Network) -> None:

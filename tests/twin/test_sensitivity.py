@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from data.errors import InputError
-from data.machine import load_machine
 from tests.twin.drives import at, drive, network, one_body
 from tests.twin.test_simulation import sample_inputs
-from twin.compile import compile_network
 from twin.network import Network
 from twin.simulation import simulate
 from twin.simulation.inputs import Inputs
 from twin.simulation.sensitivity import Selected, sensitivities
-
-SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 
 
 def gaps(
@@ -41,8 +36,7 @@ def gaps(
     return out
 
 
-def test_every_free_parameter_of_the_sample_machine() -> None:
-    sample = compile_network(load_machine(SAMPLE))
+def test_every_free_parameter_of_the_sample_machine(sample: Network) -> None:
     time_s = np.arange(0, 7201.0, 300.0)
     rpm = np.array([6000.0] * 12 + [0.0] * 6 + [2000.0] * 6)
     inputs = sample_inputs(sample, time_s, rpm, 18 + time_s / 3600)

@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from data.errors import InputError
-from data.machine import load_machine
 from plants.sample import sample_machine as truth
 from tests.twin.drives import at, closed, drive, network, one_body
-from twin.compile import compile_network
 from twin.network import Network
 from twin.simulation import choose_substeps, simulate
 
 SIGMA = 5.670374419e-8
-SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
-
-
-@pytest.fixture(scope="module")
-def sample() -> Network:
-    return compile_network(load_machine(SAMPLE))
 
 
 # closed forms of linear networks: exact, whatever the step
@@ -110,8 +101,7 @@ def test_a_body_that_only_radiates_against_a_stiff_solver() -> None:
     assert gap[2] / gap[1] == pytest.approx(4, rel=0.15)
 
 
-@pytest.mark.parametrize("method", ["BDF", "LSODA"])
-def test_the_sample_machine_against_stiff_solvers(sample: Network, method: str) -> None:
+def test_the_sample_machine_against_a_stiff_solver(sample: Network) -> None:
     """Grease that thins in both bearings, three speeds in turn; readings without lag and bonding."""
     bare = replace(sample, readings=tuple(replace(r, effects=()) for r in sample.readings))
     minutes = np.arange(0, 181.0)
@@ -131,7 +121,7 @@ def test_the_sample_machine_against_stiff_solvers(sample: Network, method: str) 
 
         floor = 0.5 * (18.0 + 18.0) if (f := _floor(sample)) is None else f
         span = (3600.0 * k, 3600.0 * (k + 1))
-        solved = solve_ivp(rate, span, states[-1], method, t_eval=[span[1]], rtol=1e-10, atol=1e-9)
+        solved = solve_ivp(rate, span, states[-1], "LSODA", t_eval=[span[1]], rtol=1e-10, atol=1e-9)
         states.append(solved.y[:, -1])
     order = [sample.cells.index(n) for n in truth.NODES]
     assert out.cells_degC is not None

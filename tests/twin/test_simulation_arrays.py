@@ -102,3 +102,21 @@ def test_bad_arrays_are_told_in_one_line() -> None:
         simulate(net, net.values, inputs, "cold")
     with pytest.raises(InputError, match=r"offsets of surroundings have shape \(1, 1, 4\), expected"):
         simulate(net, net.values, replace(inputs, offsets_K=np.zeros((1, 1, 4))))
+
+
+@pytest.mark.parametrize(
+    ("sensor", "body_degC"),
+    [
+        ({"offset": "2 K"}, 24.0),
+        ({"air": "room", "bonding": 0.75}, 28.0),  # 26 = 20 + 0.75 (28 - 20)
+        ({"air": "room", "bonding": 0.75, "offset": "3 K"}, 24.0),
+        ({"lag": "60 s"}, 26.0),
+        ({"air": "room", "bonding": 0.1}, 26.0),  # shows the air: taken as it is
+    ],
+)
+def test_the_start_undoes_what_a_sensor_adds(sensor: dict[str, object], body_degC: float) -> None:
+    net = network(sensors__t_shaft={"at": "shaft", **sensor})
+    inputs = drive(np.array([0.0, 60.0]), room=20.0, first=26.0)
+    assert start_of(net, net.values, inputs)[0, 0] == pytest.approx(body_degC, abs=1e-4)
+    if sensor.get("bonding") != 0.1:
+        assert simulate(net, net.values, inputs).readings[0, 0, 0, 0] == pytest.approx(26.0, abs=1e-4)

@@ -51,13 +51,3 @@ class Toy:
 
 def one_schedule(dt_s: float, n_intervals: int, n_batches: int = 1) -> Schedule:
     return Schedule(np.full((n_batches, n_intervals), dt_s), np.zeros((n_batches, n_intervals), int))
-
-
-def held(values: np.ndarray) -> np.ndarray:
-    """Series (1, 1, 1, M, 2) that holds each value through its interval."""
-    return np.repeat(values[:, None], 2, axis=1)[None, None, None]
-
-
-def linear(values: np.ndarray) -> np.ndarray:
-    """Series (1, 1, 1, M, 2) that runs straight through the values at the borders (M + 1,)."""
-    return np.column_stack([values[:-1], values[1:]])[None, None, None]

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from data.errors import InputError, WorkError
 from data.files import write_atomic
@@ -16,7 +15,7 @@ from twin.calibration.identifiability import Interval
 from twin.compile import compile_network, own_paths
 from twin.network import Network
 from twin.quantity import Parameter
-from twin.schema import twin_part
+from twin.schema import Calibrated, twin_part
 
 
 @dataclass(frozen=True)
@@ -59,10 +58,14 @@ def put_values(document: YamlText, updates: Mapping[str, Update], where: str) ->
             document.set(steps[:-1], steps[-1], new)
 
 
-def with_calibrated(text: str, rows: Mapping[str, Any]) -> str:
-    """The text with the twin part's `calibrated` entry, at its beginning, replaced by `rows`."""
+def with_calibrated(text: str, origin: Calibrated) -> str:
+    """The text with the twin part's `calibrated` entry, at its beginning, replaced: no empty rows, three digits."""
+    rows = {"batches": list(origin.batches), "when": origin.when, "simulated": origin.simulated}
+    rms = {k: float(f"{v:.3g}") for k, v in origin.left_out_rms.items()}
+    more = {"left_out_rms": rms, "words": origin.words}
     document = YamlText(text)
-    document.set(["twin"], "calibrated", dict(rows), order=["calibrated"], blocks=1)
+    entry = rows | {k: v for k, v in more.items() if v}
+    document.set(["twin"], "calibrated", entry, order=["calibrated"], blocks=1)
     return str(document)
 
 
@@ -89,28 +92,6 @@ def kept(value: float) -> float:
 DIGITS = 5e-5  # relative: what `twin.calibration.calibrated_file` keeps of a value
 
 
-@dataclass(frozen=True)
-class Origin:
-    """Where calibrated values come from: batches, when (ISO date and time), errors of the batches left out.
-
-    `left_out_rms` by channel in the channel's unit, empty where no batch was left out.
-    """
-
-    batches: tuple[str, ...]
-    when: str
-    simulated: bool = False
-    left_out_rms: dict[str, float] = field(default_factory=dict)
-    words: str = ""
-
-    @property
-    def rows(self) -> dict[str, Any]:
-        """The entry under `calibrated`."""
-        rows: dict[str, Any] = {"batches": list(self.batches), "when": self.when, "simulated": self.simulated}
-        if self.left_out_rms:
-            rows["left_out_rms"] = {k: float(f"{v:.3g}") for k, v in self.left_out_rms.items()}
-        return rows | ({"words": self.words} if self.words else {})
-
-
 def check_writable(source: Path, network: Network) -> str:
     """The text of a machine file into which every free parameter of its network can be written.
 
@@ -131,7 +112,7 @@ def check_writable(source: Path, network: Network) -> str:
 
 
 def calibrated_text(
-    text: str, network: Network, values: dict[str, float], intervals: list[Interval], origin: Origin, where: str
+    text: str, network: Network, values: dict[str, float], intervals: list[Interval], origin: Calibrated, where: str
 ) -> str:
     """The text of a machine file with the values (by parameter) and intervals of a calibration.
 
@@ -143,7 +124,7 @@ def calibrated_text(
         own.get(i.name, i.name): Update(network.parameters[network.index(i.name)], values[i.name], (i.low, i.high))
         for i in intervals
     }
-    new = with_calibrated(with_values(text, updates, where), origin.rows)
+    new = with_calibrated(with_values(text, updates, where), origin)
     try:
         machine = parse_machine(new, where)
         again = compile_network(machine)

@@ -109,12 +109,13 @@ def leave_batch_out(
     n = problem.inputs.n_batches
     if n < 2:
         raise InputError(f"leave-batch-out: got {n} batch, needs 2 or more; give more recordings or leave it off")
-    work = partial(_fold, options=replace(options, starts=1))
+    work = partial(_fold, problem, options=replace(options, starts=1))
     folds = []
-    for fold in _mapped(work, problem, range(n), min(options.processes, n)):
-        folds.append(fold)
-        if progress:
-            progress("leave a batch out", len(folds), n)
+    with Processes(min(options.processes, n), _start) as pool:
+        for fold in pool.map(work, range(n)):
+            folds.append(fold)
+            if progress:
+                progress("leave a batch out", len(folds), n)
     table = pd.DataFrame(_rows(problem, folds), columns=list(COLUMNS))
     return LeftOut(tuple(folds), table)
 
@@ -148,13 +149,6 @@ def _fold(problem: CalibrationProblem, b: int, options: FitOptions) -> Fold:
     except (InputError, WorkError) as error:
         raise type(error)(f"leave-batch-out without {name}: {error}") from None
     return Fold(name, rest.values_at(done.x), done.converged, done.message)
-
-
-def _mapped(
-    work: Callable[[CalibrationProblem, int], Fold], problem: CalibrationProblem, items: Sequence[int], processes: int
-) -> Iterator[Fold]:
-    with Processes(processes, _start) as pool:
-        yield from pool.map(partial(work, problem.only(range(problem.inputs.n_batches))), items)
 
 
 def _start() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,7 @@ from scipy.special import expit
 from data.arrays import Array
 from data.errors import InputError
 from twin.calibration.whiteness import correlated_rows
-
-Scale = Literal["log", "linear", "logit"]
+from twin.quantity import Scale
 
 
 @dataclass(frozen=True)

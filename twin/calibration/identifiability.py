@@ -70,16 +70,16 @@ def prior_shrinkage(fit: Fit, unknowns: Sequence[Unknown]) -> Array:
     return np.sqrt(np.diag(fit.covariance)) / np.array([u.spread for u in unknowns])
 
 
-def undetermined(fit: Fit, unknowns: Sequence[Unknown], information_below: float = 1.0) -> list[Undetermined]:
+def undetermined(fit: Fit, unknowns: Sequence[Unknown]) -> list[Undetermined]:
     """Combinations that the recordings do not determine, least determined first.
 
-    `information_below` in units of the prior's: 1 means that the posterior sd along the direction is above 0.71 of
-    the prior's. Eigenvectors of near-equal information mix at will, so their span is described by sparse vectors.
+    Along each the data's information is below the prior's: the posterior sd is above 0.71 of the prior's. Eigenvectors
+    of near-equal information mix at will, so their span is described by sparse vectors.
     """
     spread = np.array([u.spread for u in unknowns])
     # From the covariance, 1 / (information + 1): exact where information is small, whatever it is elsewhere.
     values, vectors = np.linalg.eigh(fit.covariance / np.outer(spread, spread))
-    weak = values > 1 / (1 + information_below)
+    weak = values > 1 / 2
     null = vectors[:, weak]
     information = (null * np.maximum(0.0, 1 / values[weak] - 1)) @ null.T
     found = []

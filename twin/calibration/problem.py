@@ -305,8 +305,7 @@ class CalibrationProblem:
         kept = self._last.get(_key(x, nuisance))
         if kept is not None:
             return [block.residual for block in kept]
-        simulation = simulate(self.network, self.values_at(x), *self.own(nuisance))
-        series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)
+        series = simulate(self.network, self.values_at(x), *self.own(nuisance)).shown[0]
         return [self._residual(m, s, v) for m, s, v in zip(self.measured, series, nuisance, strict=True)]
 
     @cached_property
@@ -331,8 +330,7 @@ class CalibrationProblem:
     def free_running_errors(self, values: Array) -> list[Array]:
         """Measured − simulated (n_b,) of every batch in the channels' units, started from its first readings alone."""
         start = start_of(self.network, values, self.inputs)
-        simulation = simulate(self.network, values, self.inputs, start[None])
-        series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)
+        series = simulate(self.network, values, self.inputs, start[None]).shown[0]
         return [m.value - m.of(s) for m, s in zip(self.measured, series, strict=True)]
 
     def residual_series(self, x: Array, nuisance: Sequence[Array]) -> dict[str, dict[str, Array]]:
@@ -351,7 +349,7 @@ class CalibrationProblem:
         numbers = list(dict.fromkeys([*self.network.free.tolist(), *self.nuisances.parameters.tolist()]))
         selected = Selected(numbers, len(self.nuisances.start_K) > 0, self.nuisances.surroundings.tolist())
         simulation, *slopes = sensitivities(self.network, self.values_at(x), *self.own(nuisance), selected)
-        series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)
+        series = simulation.shown[0]
         slope = np.concatenate(slopes, axis=-1)  # (Q, B, K, C)
         free = len(self.unknowns)
         varying = [numbers.index(k) for k in self.nuisances.parameters.tolist()]

@@ -1,7 +1,8 @@
-"""Compilation of mechanisms: parameters, drivers, ports and outlets."""
+"""Compilation of mechanisms, and of the surroundings, sensors and error chains that they act on."""
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,13 +11,13 @@ import numpy as np
 
 from data.arrays import Array
 from data.errors import closest
-from twin.compiling.cells import Scope, several
-from twin.compiling.parameters import SHARE
+from twin.compiling.cells import Scope, number, several
+from twin.compiling.parameters import LENGTH, MATERIAL, OFFSET, SHARE, TEMPERATURE
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Mechanism
-from twin.network import Heat, Law, Outlet, Port
-from twin.quantity import same_dimension
-from twin.schema import MechanismPart
+from twin.network import CompiledSurrounding, ErrorRow, Heat, Law, Outlet, Port, Reading
+from twin.quantity import Monomial, Spec, Value, same_dimension
+from twin.schema import ChainLink, ErrorChain, MechanismPart, Sensor, Surrounding, Tilt
 
 
 def mechanism_of(name: str, given: MechanismPart) -> Mechanism:
@@ -34,10 +35,7 @@ def mechanism_of(name: str, given: MechanismPart) -> Mechanism:
 def law_of(scope: Scope, name: str, given: MechanismPart) -> Law:
     """A mechanism with its parameters, drivers and ports looked up."""
     key, mechanism = f"mechanisms.{name}", mechanism_of(name, given)
-    specs = {s.name: s for s in mechanism.parameters}
-    for p in given.parameters:
-        if p not in specs:
-            raise ValueError(f"{key}.parameters: {given.law} has no parameter {p!r}; {closest(p, specs)}")
+    mechanism.check_names(name, given)
     parameters = {
         s.name: scope.table.add(f"{key}.{s.name}", s, given.parameters.get(s.name), mechanism.source)
         for s in mechanism.parameters
@@ -154,8 +152,103 @@ def _outlets(scope: Scope, name: str, given: MechanismPart) -> tuple[Outlet, ...
         raise ValueError(f"{key}: got {len(rest)} places with 'rest', expected one, so that the shares make up 1")
     outlets = []
     for place, share in into.items():
-        number = None if isinstance(share, str) else scope.table.add(f"{key}.{place}", SHARE, share)
-        outlets.append(Outlet(scope.cells.weights(place, key), number, place))
+        index = None if isinstance(share, str) else scope.table.add(f"{key}.{place}", SHARE, share)
+        outlets.append(Outlet(scope.cells.weights(place, key), index, place))
     if sum(scope.table.rows[o.share].value for o in outlets if o.share is not None) > 1:
         raise ValueError(f"{key}: the shares add up to more than 1; lower them, or leave one out as 'rest'")
     return tuple(outlets)
+
+
+def surrounding(scope: Scope, name: str, given: Surrounding) -> CompiledSurrounding:
+    key = f"surroundings.{name}"
+    for channel in [given.channel] if given.channel else given.first or ():
+        if channel not in scope.machine.channels:
+            raise ValueError(f"{key}: no channel {channel!r}; {closest(channel, scope.machine.channels)}")
+    return CompiledSurrounding(
+        name,
+        given.channel,
+        None if given.value is None else scope.table.add(f"{key}.value", TEMPERATURE, given.value),
+        given.first or (),
+        None if given.follow is None else scope.table.add(f"{key}.follow", SHARE, given.follow),
+        None if given.offset is None else scope.table.add(f"{key}.offset", OFFSET, given.offset),
+        0.0 if given.per_batch is None else number(f"{key}.per_batch", given.per_batch, "K"),
+        acting(scope, "surrounding_K", name),
+    )
+
+
+def reading(scope: Scope, channel: str, given: Sensor) -> Reading:
+    key = f"sensors.{channel}"
+    _channel(scope, key, channel, "temperature", "ambient")
+    effects = []
+    for attribute, law in (("bonding", "sensor_bonding"), ("lag", "sensor_lag"), ("offset", "sensor_offset")):
+        value = getattr(given, attribute)
+        if value is None:
+            continue
+        mechanism = MECHANISMS[law]()
+        ports = {}
+        if mechanism.ports:
+            if given.air is None:
+                raise ValueError(f"{key}.air is missing; name the surrounding that cools the sensor")
+            ports = {mechanism.ports[0]: port_of(scope, given.air, f"{key}.air")}
+        index = scope.table.add(f"{key}.{attribute}", mechanism.parameters[0], value)
+        effects.append(Law(f"{channel}.{attribute}", mechanism, {mechanism.parameters[0].name: index}, {}, ports))
+    noise = _noise(scope, key, channel, given.noise, "K")
+    return Reading(
+        channel, scope.cells.weights(given.at, f"{key}.at"), (*effects, *acting(scope, "reading", channel)), noise
+    )
+
+
+def _channel(scope: Scope, key: str, channel: str, *roles: str) -> None:
+    if channel not in scope.machine.channels:
+        raise ValueError(f"{key}: no channel {channel!r} in 'channels'; {closest(channel, scope.machine.channels)}")
+    if scope.machine.channels[channel].role not in roles:
+        raise ValueError(f"{key}: channel {channel!r} is a {scope.machine.channels[channel].role}, expected {roles[0]}")
+
+
+def _noise(scope: Scope, key: str, channel: str, given: str | float | None, unit: str) -> float:
+    """Standard deviation: as given, or the rounding error of the channel's resolution."""
+    if given is not None:
+        return number(f"{key}.noise", given, unit)
+    resolution = scope.machine.channels[channel].resolution
+    if resolution is None:
+        raise ValueError(f"{key}.noise is missing and channel {channel!r} states no resolution; give one of them")
+    return resolution / math.sqrt(12.0)
+
+
+def error(scope: Scope, channel: str, given: ErrorChain) -> ErrorRow:
+    key = f"errors.{channel}"
+    _channel(scope, key, channel, "error")
+    unit = scope.machine.channels[channel].unit
+    gain = Spec("gain", f"{unit}/K", "a displacement per kelvin", scale="linear")
+    rows, gains, words = [], [], []
+    for k, c in enumerate(given.chain):
+        at = f"{key}.chain[{k}]"
+        rows.append(scope.cells.weights(c.body, f"{at}.body"))
+        gains.append(_gain(scope, at, c, c.body, gain, length=1.0))
+        words.append(c.words or c.body)
+    for k, t in enumerate(given.tilts):
+        at = f"{key}.tilts[{k}]"
+        rows.append(scope.cells.weights(t.hot, f"{at}.hot") - scope.cells.weights(t.cold, f"{at}.cold"))
+        gains.append(_gain(scope, at, t, t.hot, gain, height=1.0, lever=1.0, depth=-1.0))
+        words.append(t.words or f"{t.hot} - {t.cold}")
+    return ErrorRow(
+        channel, unit, np.array(rows).reshape(len(rows), len(scope.cells)), tuple(gains), tuple(words),
+        acting(scope, "displacement", channel), acting(scope, "reading", channel),
+        _noise(scope, key, channel, given.noise, unit),
+    )  # fmt: skip
+
+
+def _expansion(scope: Scope, at: str, given: Value | None, place: str) -> int:
+    if given is not None:
+        return scope.table.add(f"{at}.expansion", MATERIAL["expansion"], given)
+    body = scope.part.bodies[place.partition("@")[0]]
+    return scope.table.material(body.material, "expansion", f"{at}.expansion")
+
+
+def _gain(scope: Scope, at: str, given: ChainLink | Tilt, place: str, gain: Spec, **lengths: float) -> Monomial:
+    """A signed gain as given, or the expansion times the named lengths to their powers."""
+    if given.gain is not None:
+        return Monomial(float(given.sign), ((scope.table.add(f"{at}.gain", gain, given.gain), 1.0),))
+    expansion = _expansion(scope, at, given.expansion, place)
+    sizes = ((scope.table.add(f"{at}.{n}", LENGTH, getattr(given, n)), e) for n, e in lengths.items())
+    return Monomial(float(given.sign), ((expansion, 1.0), *sizes))

@@ -157,17 +157,21 @@ class Mechanism(ABC):
         Raises:
             ValueError: a parameter that the mechanism does not have, with the closest.
         """
-        specs = {s.name: s for s in self.parameters}
-        for p in part.parameters:
-            if p not in specs:
-                raise ValueError(
-                    f"mechanisms.{name}.parameters: {self.key} has no parameter {p!r}; {closest(p, specs)}"
-                )
+        self.check_names(name, part)
         out = {}
-        for key, spec in specs.items():
-            value = part.parameters.get(key) or Value(value=spec.value or 0.0, source=self.source)
-            out[key] = value if value.bounds else value.model_copy(update={"bounds": (spec.low, spec.high)})
+        for spec in self.parameters:
+            value = part.parameters.get(spec.name) or Value(value=spec.value or 0.0, source=self.source)
+            out[spec.name] = value if value.bounds else value.model_copy(update={"bounds": (spec.low, spec.high)})
         return out
+
+    def check_names(self, name: str, part: MechanismPart) -> None:
+        """Raises ValueError: a parameter that the mechanism does not have, with the closest."""
+        names = [s.name for s in self.parameters]
+        for p in part.parameters:
+            if p not in names:
+                raise ValueError(
+                    f"mechanisms.{name}.parameters: {self.key} has no parameter {p!r}; {closest(p, names)}"
+                )
 
     @classmethod
     def effects(cls) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from data.errors import closest
 from twin.compiling.cells import several
 from twin.mechanisms.base import Mechanism, PortRole, View, real
 from twin.quantity import Spec, Value
-from twin.schema import Body, ChainLink, ErrorChain, Exposure, Link, MechanismPart, Tilt, TwinPart
+from twin.schema import Body, ChainLink, Exposure, Link, MechanismPart, Tilt, TwinPart
 
 
 class ColumnBending(Mechanism):
@@ -245,16 +245,13 @@ def _given(mechanism: Mechanism, name: str, part: MechanismPart) -> dict[str, Va
 
 
 def _with_unit(value: Value, spec: Spec) -> Value:
-
     def with_unit(v: Any) -> Any:
         return f"{v} {spec.unit}" if v is not None and len(str(v).split()) == 1 else v
 
-    bounds = tuple(with_unit(b) for b in value.bounds or ())
-    update: dict[str, Any] = {"value": with_unit(value.value), "bounds": bounds}
-    update["prior"] = with_unit(value.prior)
+    update = {key: with_unit(getattr(value, key)) for key in ("value", "prior")}
     if spec.scale == "linear":
         update["spread"] = with_unit(value.spread)
-    return value.model_copy(update=update)
+    return value.model_copy(update=update | {"bounds": tuple(with_unit(b) for b in value.bounds or ())})
 
 
 def _on_errors(
@@ -271,11 +268,7 @@ def _on_errors(
     for channel in several(part.acts_on):
         if channel not in errors:
             raise ValueError(f"mechanisms.{name}.acts_on: no error {channel!r}; {closest(channel, errors)}")
-        errors[channel] = _longer(errors[channel], piece)
+        key = "tilts" if isinstance(piece, Tilt) else "chain"
+        given = errors[channel]
+        errors[channel] = given.model_copy(update={key: (*getattr(given, key), piece)})
     return twin.model_copy(update={"errors": errors})
-
-
-def _longer(chain: ErrorChain, piece: ChainLink | Tilt) -> ErrorChain:
-    if isinstance(piece, Tilt):
-        return chain.model_copy(update={"tilts": (*chain.tilts, piece)})
-    return chain.model_copy(update={"chain": (*chain.chain, piece)})

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from data.arrays import Array
 from data.errors import InputError
 from twin.network import CompiledSurrounding, Law, Network
-from twin.simulation.inputs import Inputs, parameters_of
+from twin.simulation.inputs import Inputs, at_borders
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,8 @@ class Air:
 
     def borders(self, s: int, every: int = 1) -> Array:
         """The same at the interval borders ``::every`` (P, B, K): where it jumps, as it was before the jump."""
-
-        def before(ends: Array) -> Array:
-            return np.concatenate([ends[..., :1, 0], ends[..., 1]], axis=-1)[..., ::every]
-
-        return self._sum(s, before(self.recorded_degC[s]), None if self.extra_K is None else before(self.extra_K[:, s]))
+        extra_K = None if self.extra_K is None else at_borders(self.extra_K[:, s])[..., ::every]
+        return self._sum(s, at_borders(self.recorded_degC[s])[..., ::every], extra_K)
 
     def _sum(self, s: int, recorded_degC: Array, extra_K: Array | None) -> Array:
         axes = (slice(None), s, *(None,) * recorded_degC.ndim)
@@ -113,12 +110,8 @@ def effect_K(law: Law, values: Array, inputs: Inputs, air: Air) -> Array:
         ends = air.ends(port.surrounding)
         degC[role] = ends[..., 0] if along else np.moveaxis(ends, -1, -2)
         rise_K[role] = degC[role] - (degC[role][..., :1] if along else degC[role][..., :1, :1])
-    view = inputs.intervals.view(law, along, degC=degC, rise_K=rise_K)
-    out = np.asarray(law.mechanism.surrounding_K(view, parameters_of(law, values, 2 if along else 3)))
-    n_batches, n_intervals = inputs.valid.shape
-    if along:
-        return np.repeat(np.broadcast_to(out, (len(values), n_batches, n_intervals))[..., None], 2, axis=-1)
-    return np.moveaxis(np.broadcast_to(out, (len(values), n_batches, 2, n_intervals)), 2, 3)
+    out = inputs.intervals.call(law, "surrounding_K", values, along, degC=degC, rise_K=rise_K)
+    return inputs.intervals.ends(out, len(values), along)
 
 
 def _extra(network: Network, values: Array, inputs: Inputs, air: Air) -> Array | None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from data.arrays import Array, Numeric
 from data.errors import InputError
 from twin.network import Edge, Heat, Law, Network, Port
 from twin.simulation.air import Air, air_of
-from twin.simulation.inputs import STEP, Inputs, along_time, heat_W, parameters_of, reads_time
+from twin.simulation.inputs import EVERY, STEP, Inputs, along_time, heat_W, reads_time
 from twin.simulation.response import Forcing, Response
 from twin.simulation.schedule import MOST, Drive, Regimes, Schedule, at_tuples, distinct, factor_series, regimes_of
 
@@ -83,28 +83,17 @@ class Balance:
         drive: Drive = kept[key]
         return drive
 
-    def directions(self, heats: Sequence[Heat]) -> Array:
-        """Where heats go, (P, R, J, N), the same in every regime."""
-        rows = np.stack([h.direction(self.values) for h in heats], axis=1)
-        return np.repeat(rows[:, None], self.regimes.count, axis=1)
+    def directions(self, heats: Sequence[Heat | Source]) -> Array:
+        """Where heats or sources go, (P, R, J, N), the same in every regime."""
+        each = [h.direction(self.values) if isinstance(h, Heat) else h.direction for h in heats]
+        return np.repeat(np.stack(each, axis=1)[:, None], self.regimes.count, axis=1)
 
     def driven_W(self, heat: Heat, values: Array | None = None) -> Array:
         """Watts (P or 1, B, M, 2) of a heat that does not depend on temperature, at both ends of every interval."""
         along, values = along_time(heat), self.values if values is None else values
-        views = self.inputs.intervals
-
-        def call(law: Law, effect: str) -> Array:
-            p = parameters_of(law, values, 2 if along else 3)
-            return np.asarray(getattr(law.mechanism, effect)(views.view(law, along), p))
-
-        out = heat_W(heat, call)
-        times = self.inputs.times.get(heat.law.name)
-        if times is not None:
-            out = out * times.reshape(-1, *(1,) * (1 if along else 2))
-        shape = (len(values), *self.inputs.valid.shape)
-        if along:
-            return np.broadcast_to(np.broadcast_to(out, shape)[..., None], (*shape, 2))
-        return np.moveaxis(np.broadcast_to(out, (shape[0], shape[1], 2, shape[2])), 2, 3)
+        intervals = self.inputs.intervals
+        out = heat_W(heat, lambda law, effect: intervals.call(law, effect, values, along))
+        return intervals.ends(intervals.times(heat, out, along), len(values), along)
 
 
 def balance_of(network: Network, values: Array, inputs: Inputs) -> Balance:
@@ -168,12 +157,7 @@ def check_values(network: Network, values: Array) -> None:
 
 
 def _timed(heat: Heat) -> bool:
-    effects: list[tuple[Law, str]] = [(heat.law, "heat_W"), *((f, "factor") for f in heat.factors)]
-    check: Callable[[Law, str], bool] = reads_time
-    return any(check(law, effect) for law, effect in effects)
-
-
-EVERY = slice(None)
+    return reads_time(heat.law, "heat_W") or any(reads_time(f, "factor") for f in heat.factors)
 
 
 @dataclass(frozen=True)
@@ -186,35 +170,6 @@ class Borders:
         """Of place k at both ends of some intervals, (P, B, 2, m)."""
         row = self.degC[k]
         return np.stack([row[..., :-1][..., part], row[..., 1:][..., part]], axis=-2)
-
-
-class Source(Protocol):
-    """One series of temperature-dependent heat.
-
-    `direction` (P, N) is where a watt goes, `places` the rows of `Borders` that it depends on. One `along` time needs
-    the whole series from the start, and holds during an interval.
-    """
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def direction(self) -> Numeric: ...
-
-    @property
-    def places(self) -> tuple[int, ...]: ...
-
-    @property
-    def along(self) -> bool: ...
-
-    def watts(self, seen: Borders, part: slice, values: Numeric | None = None) -> Numeric:
-        """W (P, B, 2, m) in some intervals; other parameter values (P, n) for a derivative."""
-
-    def slopes(self, seen: Borders, part: slice) -> dict[int, Numeric]:
-        """Derivative by the temperature of each place, W/K (P, B, 2, m)."""
-
-    def surrounding_slopes(self, seen: Borders, part: slice) -> dict[int, Numeric]:
-        """The same by the temperature of each surrounding that it depends on."""
 
 
 class Places:
@@ -234,7 +189,11 @@ class Places:
 
 @dataclass(frozen=True)
 class HeatSource:
-    """A heat whose law, or a law that multiplies it, has ports."""
+    """A heat whose law, or a law that multiplies it, has ports: one series of temperature-dependent heat.
+
+    `direction` (P, N) is where a watt goes, `places` the rows of `Borders` that it depends on. One `along` time needs
+    the whole series from the start, and holds during an interval.
+    """
 
     balance: Balance
     heat: Heat
@@ -258,12 +217,15 @@ class HeatSource:
         return along_time(self.heat)
 
     def watts(self, seen: Borders, part: slice, values: Numeric | None = None) -> Numeric:
+        """W (P, B, 2, m) in some intervals; other parameter values (P, n) for a derivative."""
         return self._evaluate(seen, part, values=values)
 
     def slopes(self, seen: Borders, part: slice) -> dict[int, Numeric]:
+        """Derivative by the temperature of each place, W/K (P, B, 2, m)."""
         return {k: self._evaluate(seen, part, place=k).imag / STEP for k in self.places}
 
     def surrounding_slopes(self, seen: Borders, part: slice) -> dict[int, Numeric]:
+        """The same by the temperature of each surrounding that it depends on."""
         laws = (self.heat.law, *self.heat.factors)
         which = dict.fromkeys(p.surrounding for law in laws for p in law.ports.values() if p.cells is None)
         return {s: self._evaluate(seen, part, surrounding=s).imag / STEP for s in which}
@@ -271,9 +233,7 @@ class HeatSource:
     def _driven(self, law: Law, effect: str) -> Numeric:
         """What a law without ports gives in all intervals, worked out once."""
         if (law.name, effect) not in self._known:
-            view = self.balance.inputs.intervals.view(law, self.along)
-            p = parameters_of(law, self.balance.values, 2 if self.along else 3)
-            out = np.asarray(getattr(law.mechanism, effect)(view, p))
+            out = self.balance.inputs.intervals.call(law, effect, self.balance.values, self.along)
             shape = (1, *self.balance.inputs.valid.shape)
             shape = shape if self.along else (1, shape[1], 2, shape[2])
             self._known[law.name, effect] = np.broadcast_to(out, np.broadcast_shapes(out.shape, shape))
@@ -306,13 +266,9 @@ class HeatSource:
                 return self._driven(law, effect)[..., part]
             pairs = {role: temperature(law, role, port) for role, port in law.ports.items()}
             degC, rise_K = ({r: pair[i] for r, pair in pairs.items()} for i in (0, 1))
-            view = balance.inputs.intervals.view(law, along, part, degC, rise_K)
-            return np.asarray(getattr(law.mechanism, effect)(view, parameters_of(law, values, 2 if along else 3)))
+            return balance.inputs.intervals.call(law, effect, values, along, part, degC, rise_K)
 
-        out = heat_W(self.heat, call)
-        times = balance.inputs.times.get(self.name)
-        if times is not None:
-            out = out * times.reshape(-1, *(1,) * (1 if along else 2))
+        out = balance.inputs.intervals.times(self.heat, heat_W(self.heat, call), along)
         n_sets, n_batches = max(len(values), seen.degC.shape[1]), seen.degC.shape[2]
         if along:
             out = np.broadcast_to(out, (n_sets, n_batches, hi))[..., lo::step]
@@ -322,15 +278,15 @@ class HeatSource:
 
 @dataclass(frozen=True)
 class ExchangeSource:
-    """What the conductance of an edge is, in every interval, beyond the constant that its regime has."""
+    """What the conductance of an edge is, in every interval, beyond the constant that its regime has.
+
+    Methods as of `HeatSource`.
+    """
 
     balance: Balance
     edge: Edge
     place: int
-
-    @property
-    def along(self) -> bool:
-        return False
+    along: ClassVar[bool] = False
 
     @property
     def name(self) -> str:
@@ -371,6 +327,9 @@ class ExchangeSource:
 
     def _both(self, part: slice) -> Numeric:
         return np.repeat(self.excess_W_per_K[..., None, part], 2, axis=-2)
+
+
+Source = HeatSource | ExchangeSource
 
 
 def sources_of(balance: Balance, places: Places) -> tuple[list[Source], list[HeatSource]]:

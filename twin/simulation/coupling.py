@@ -96,12 +96,6 @@ def solve(balance: Balance, sources: Sequence[Source], rows: Array, start_degC: 
     return _Solver(balance, sources, rows, start_degC, tolerance_K / 10.0).solve()
 
 
-def outlets(balance: Balance, sources: Sequence[Source]) -> Array:
-    """Where the sources' heat goes, (P, R, k, N), the same in every regime."""
-    rows = np.stack([s.direction for s in sources], axis=1)
-    return np.repeat(rows[:, None], balance.regimes.count, axis=1)
-
-
 class _Solver:
     """`seen` (n + k, P, B, M + 1) are the temperatures of the places and along each source's own direction."""
 
@@ -110,7 +104,7 @@ class _Solver:
     ) -> None:
         self.balance, self.sources, self.rows, self.tolerance_K = balance, sources, rows, tolerance_K
         self.directions = np.stack([s.direction for s in sources], axis=1)  # (P, k, N)
-        self.outlets = outlets(balance, sources)
+        self.outlets = balance.directions(sources)
         n_sets = max(len(balance.values), len(start_degC))
         n_batches, self.n_intervals = balance.inputs.valid.shape
         self.now_degC = np.broadcast_to(start_degC, (n_sets, *start_degC.shape[1:]))

@@ -29,7 +29,7 @@ EVERY = slice(None)
 
 @dataclass(frozen=True)
 class Intervals:
-    """Builds views of some intervals of B batches.
+    """Evaluates laws in intervals of B batches.
 
     A law that works point by point gets (…, B, 2, m): start and end of each interval, with the interval's drivers. A
     law along time gets (…, B, m): the starts, so that what it does in an interval depends on nothing later.
@@ -37,22 +37,39 @@ class Intervals:
 
     inputs: Inputs
 
-    def view(
+    def call(
         self,
         law: Law,
-        along: bool = False,
+        effect: str,
+        values: Numeric,
+        along: bool,
         part: slice = EVERY,
         degC: Mapping[str, Numeric] | None = None,
         rise_K: Mapping[str, Numeric] | None = None,
-    ) -> View:
-        """Inputs of a law in the intervals `part`; `along` time or at both ends. Temperatures by the law's ports."""
+    ) -> Numeric:
+        """A law's effect at values (P, n) in the intervals `part`: (…, m) `along` time, else (…, 2, m) at both ends.
+
+        Temperatures by the law's ports; the result broadcasts to (P, B, …).
+        """
+        ends = 0 if along else slice(None)
         driver = {role: self.inputs.drivers[c][:, part] for role, c in law.drivers.items()}
+        driver = driver if along else {role: d[:, None] for role, d in driver.items()}
+        time_s, clock_h = self._time_s[:, ends, part], self._clock_h[:, ends, part]
+        view = View(degC or {}, rise_K or {}, driver, time_s, clock_h, self._step_s)
+        return np.asarray(getattr(law.mechanism, effect)(view, parameters_of(law, values, 2 if along else 3)))
+
+    def ends(self, out: Numeric, n_sets: int, along: bool) -> Numeric:
+        """What `call` gives for all intervals as (n_sets, B, M, 2); a law along time holds in each."""
+        n_batches, n_intervals = self.inputs.valid.shape
         if along:
-            return View(
-                degC or {}, rise_K or {}, driver, self._time_s[:, 0, part], self._clock_h[:, 0, part], self._step_s
-            )
-        driver = {role: d[:, None] for role, d in driver.items()}
-        return View(degC or {}, rise_K or {}, driver, self._time_s[..., part], self._clock_h[..., part], self._step_s)
+            out = np.broadcast_to(out, (n_sets, n_batches, n_intervals))
+            return np.broadcast_to(out[..., None], (*out.shape, 2))
+        return np.moveaxis(np.broadcast_to(out, (n_sets, n_batches, 2, n_intervals)), 2, 3)
+
+    def times(self, heat: Heat, out: Numeric, along: bool) -> Numeric:
+        """A heat as `call` gives it, times each batch's own factor where it has one."""
+        times = self.inputs.times.get(heat.law.name)
+        return out if times is None else out * times.reshape(-1, *(1,) * (1 if along else 2))
 
     @cached_property
     def _time_s(self) -> Numeric:
@@ -76,6 +93,11 @@ class Intervals:
 def parameters_of(law: Law, values: Numeric, axes: int) -> dict[str, Numeric]:
     """A law's parameters (P, 1, …) with `axes` further axes, from values (P, n)."""
     return {name: values[:, j].reshape(-1, *(1,) * axes) for name, j in law.parameters.items()}
+
+
+def at_borders(ends: Numeric) -> Numeric:
+    """Values at both ends of every interval (…, M, 2) at the borders (…, M + 1): where they jump, before the jump."""
+    return np.concatenate([ends[..., :1, 0], ends[..., 1]], axis=-1)
 
 
 def stepped(values: Numeric, j: int) -> Numeric:
@@ -171,12 +193,6 @@ class Inputs:
     def valid(self) -> NDArray[np.bool_]:
         """Which intervals are no padding, (B, M)."""
         return np.asarray(np.arange(self.time_s.shape[1] - 1) < self.n_intervals[:, None])
-
-    @property
-    def valid_rows(self) -> NDArray[np.bool_]:
-        """Which rows of the recordings are no padding, (B, K)."""
-        rows = np.arange((self.time_s.shape[1] - 1) // self.every + 1)
-        return np.asarray(rows * self.every <= self.n_intervals[:, None])
 
     def refined(self, factor: int) -> Inputs:
         """Every interval cut into equal parts: drivers held, surroundings linear; the recording's rows stay."""

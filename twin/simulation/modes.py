@@ -43,11 +43,10 @@ class Modes:
     def n_nodes(self) -> int:
         return self.rate_per_s.shape[2]
 
-    def time_constants_s(self, regime: int | None = None) -> Array:
-        """Time constants, s, slowest first: (P, R, N), or (P, N) of one regime. inf: the mode never decays."""
-        rate = self.rate_per_s if regime is None else self.rate_per_s[:, regime]
+    def time_constants_s(self) -> Array:
+        """Time constants (P, R, N), s, slowest first; inf: the mode never decays."""
         with np.errstate(divide="ignore"):
-            return np.asarray(1.0 / rate)
+            return np.asarray(1.0 / self.rate_per_s)
 
     def of_sets(self, sets: slice) -> Modes:
         """The modes of some parameter sets; of the only one, if there is only one."""

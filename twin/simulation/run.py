@@ -18,8 +18,8 @@ from data.errors import InputError
 from twin.network import Network
 from twin.simulation.balance import Balance, HeatSource, Places, Source, balance_of, check_values, sources_of
 from twin.simulation.channels import Rows, shown, watch
-from twin.simulation.coupling import Coupled, outlets, plain_modes, solve
-from twin.simulation.inputs import Inputs
+from twin.simulation.coupling import Coupled, plain_modes, solve
+from twin.simulation.inputs import Inputs, at_borders
 from twin.simulation.response import Response, States
 from twin.simulation.start import checked_start, excess_K
 
@@ -59,7 +59,7 @@ def solved_balance(
     rows = np.array(places.rows[:n_places]).reshape(n_places, network.n_cells)
     coupled = solve(balance, sources, rows, start_degC, tolerance_K)
     response = Response(coupled.chord.modes, balance.schedule)
-    heat = balance.forcing(response) + response.forcing(outlets(balance, sources), coupled.series_W)
+    heat = balance.forcing(response) + response.forcing(balance.directions(sources), coupled.series_W)
     return Solved(balance, sources, places, start_degC, response, coupled, response.run(heat, start_degC), asleep)
 
 
@@ -91,7 +91,7 @@ def bulge_K(solved: Solved, cells_degC: Array) -> Array:
     balance, modes = solved.balance, solved.response.modes
     terms = list(balance.known)
     if solved.coupled is not None:
-        terms.append((outlets(balance, solved.sources), solved.coupled.series_W))
+        terms.append((balance.directions(solved.sources), solved.coupled.series_W))
     out = np.zeros((*cells_degC.shape[:2], *balance.inputs.dt_s.shape[1:], balance.network.n_cells))
     for r in range(balance.regimes.count):
         here = (balance.regimes.of == r) & balance.inputs.valid
@@ -136,6 +136,11 @@ class Simulation:
     air_degC: Array | None = None
     heat_W: Mapping[str, Array] = field(default_factory=dict)
     heat_J: Mapping[str, Array] = field(default_factory=dict)
+
+    @property
+    def shown(self) -> Array:
+        """Readings, then errors, (P, B, K, n_sensors + n_errors)."""
+        return np.concatenate([self.readings, self.errors], axis=-1)
 
 
 def simulate(
@@ -237,7 +242,7 @@ def _heats(solved: Solved, every: int) -> tuple[dict[str, Array], dict[str, Arra
     watts_at, joules_at = {}, {}
     for name, ends in series.items():
         ends = np.broadcast_to(ends, (n_sets, *ends.shape[1:]))
-        at = np.concatenate([ends[:, :, :1, 0], ends[..., 1]], axis=-1)
+        at = at_borders(ends)
         total = np.cumsum(ends.mean(axis=-1) * dt_s, axis=-1)
         watts_at[name] = at[..., ::every]
         joules_at[name] = np.concatenate([np.zeros_like(total[..., :1]), total], axis=-1)[..., ::every]

@@ -429,7 +429,7 @@ def at_tuples(law: Law, effect: str, values: Array, inputs: Inputs, first: NDArr
 def factor_series(law: Law, values: Array, inputs: Inputs) -> Array:
     """A conductance factor (P, B, M) in every interval, by its start."""
     along = law.mechanism.along_time
-    out = law.mechanism.factor(inputs.intervals.view(law, along), parameters_of(law, values, 2 if along else 3))
+    out = inputs.intervals.call(law, "factor", values, along)
     if not along and np.ndim(out) > 1:
         out = out[..., 0, :]
     return np.broadcast_to(out, (len(values), *inputs.valid.shape))

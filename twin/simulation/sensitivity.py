@@ -22,8 +22,7 @@ from twin.network import Edge, Heat, Network
 from twin.simulation.air import effect_K, follows
 from twin.simulation.balance import Balance, Borders, HeatSource, Source
 from twin.simulation.channels import Rows, Tangents, shown
-from twin.simulation.coupling import outlets
-from twin.simulation.inputs import STEP, Inputs, stepped
+from twin.simulation.inputs import STEP, Inputs, at_borders, stepped
 from twin.simulation.modes import first_order_hold
 from twin.simulation.response import Response
 from twin.simulation.run import (
@@ -239,7 +238,7 @@ class Answer:
         regime, dt_s = kinds // len(schedule.step_s), schedule.step_s[kinds % len(schedule.step_s), None]
         decay, start_s, end_s = first_order_hold(modes.rate_per_s[0, regime], dt_s * (kinds >= 0)[:, None])
         shape = modes.shape[0, regime]
-        modal = (outlets(balance, solved.sources)[0, regime] @ shape).swapaxes(-1, -2)
+        modal = (balance.directions(solved.sources)[0, regime] @ shape).swapaxes(-1, -2)
         self.keeps = (shape * decay[:, None]) @ modes.inverse[0, regime]  # (kinds, N, N); behind the end all of it
         self.of_start = shape @ (start_s[..., None] * modal)  # (kinds, N, k)
         self.of_end = shape @ (end_s[..., None] * modal)
@@ -354,7 +353,7 @@ class _Tangents:
         air_K = np.zeros((len(self.unknowns), len(network.surroundings), inputs.n_batches, n_rows))
         for q, u in enumerate(self.unknowns):
             for s, ends in u.air_K.items():
-                air_K[q, s] = np.concatenate([ends[:, :1, 0], ends[..., 1]], axis=-1)[:, :: self.every]
+                air_K[q, s] = at_borders(ends)[:, :: self.every]
         return Tangents(seen[: self.n_places], chain, air_K, numbers)
 
     def _alone(self, matrix: Array, every: int) -> Array:

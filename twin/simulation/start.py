@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -166,7 +165,10 @@ def steady_state(
     direction = np.array([h.direction(values)[0] for h in network.heats]).reshape(-1, network.n_cells)
 
     def watts(degC: Array) -> Array:
-        return np.array([_watts(network, k, values, drivers, degC, air) for k in range(len(network.heats))])
+        def call(law: Law, effect: str) -> Array:
+            return _called(law, effect, values, drivers, degC, air)
+
+        return np.array([heat_W(heat, call) for heat in network.heats])
 
     def excess_W(degC: Array) -> Array:
         return known - conductance @ degC + watts(degC) @ direction
@@ -201,13 +203,6 @@ def _surroundings(network: Network, given: float | Mapping[str, float]) -> Array
         if name not in given:
             raise InputError(f"machine {network.machine}: no temperature for surrounding {name!r}; give one in degC")
     return np.array([float(given[n]) for n in names])
-
-
-def _watts(network: Network, k: int, values: Array, drivers: Mapping[str, float], degC: Array, air: Array) -> Any:
-    def call(law: Law, effect: str) -> Array:
-        return _called(law, effect, values, drivers, degC, air)
-
-    return heat_W(network.heats[k], call)
 
 
 def _called(law: Law, effect: str, values: Array, drivers: Mapping[str, float], degC: Array, air: Array) -> Array:

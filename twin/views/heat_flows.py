@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from data.arrays import Array
 from data.errors import InputError, closest
 from twin.network import Edge, Network
-from twin.quantity import values_of
 from twin.simulation import Simulation
 from twin.simulation.air import air_of
 from twin.simulation.inputs import Inputs
@@ -80,18 +79,11 @@ class HeatFlows:
         )
 
 
-def heat_flows(
-    simulation: Simulation,
-    inputs: Inputs,
-    values: Array | None = None,
-    batch: int | str = 0,
-    which: int = 0,
-    simulated: bool = True,
-) -> HeatFlows:
-    """The flows of one batch and parameter set of a simulation with its cells kept.
+def heat_flows(simulation: Simulation, inputs: Inputs, batch: int | str = 0) -> HeatFlows:
+    """The flows of one batch of a simulation at the network's own values, with its cells kept.
 
-    `inputs` and `values` (P, n) or (n,) are those of the simulation; None: the network's own values. `simulated` is the
-    label: true also with recorded drivers, since every watt is computed.
+    `inputs` are those of the simulation. The flows count as simulated also with recorded drivers, since every watt is
+    computed.
 
     Raises:
         InputError: no cells kept, other inputs than the simulation's, an unknown batch, or conductances that change
@@ -99,24 +91,21 @@ def heat_flows(
     """
     network = simulation.network
     b, every = _fits(simulation, inputs, batch)
-    p = np.atleast_2d(values_of(network.parameters) if values is None else values)
-    p = p[[which if len(p) > 1 else 0]]
+    p = np.atleast_2d(network.values)
     one = inputs.batch([b])
     k = int(one.n_intervals[0]) // every + 1
     regimes = regimes_of(network, p, one)
     regime = _regime(regimes.of[0, : (k - 1) * every].reshape(k - 1, every), simulation.batch_ids[b])
     factor = regimes.factor[0]  # (R, F)
-    if one.offsets_K is not None:
-        one = one.with_own(one.times, one.offsets_K[[which if len(one.offsets_K) > 1 else 0]])
     air = air_of(network, p, one)
     dt_s = one.dt_s[0, : (k - 1) * every]
-    grouped = (k - 1, every)
+    grouped, n_air = (k - 1, every), len(network.surroundings)
     air_Ks = np.array(
-        [(air.ends(s)[0, 0, : (k - 1) * every].mean(-1) * dt_s).reshape(grouped).sum(-1) for s in range(_n(network))]
-    ).reshape(_n(network), k - 1)
+        [(air.ends(s)[0, 0, : (k - 1) * every].mean(-1) * dt_s).reshape(grouped).sum(-1) for s in range(n_air)]
+    ).reshape(n_air, k - 1)
     assert simulation.cells_degC is not None
-    cells = simulation.cells_degC[which, b, :k]
-    joules = {name: np.diff(j[which, b, :k]) for name, j in simulation.heat_J.items()}
+    cells = simulation.cells_degC[0, b, :k]
+    joules = {name: np.diff(j[0, b, :k]) for name, j in simulation.heat_J.items()}
     stored_J = network.capacity_J_per_K(p[0]) * np.diff(cells, axis=0)
     spans_s = dt_s.reshape(grouped).sum(-1)
     cells_Ks = _integrals(network, p, factor, regime, cells, spans_s, air_Ks, joules, stored_J)
@@ -131,7 +120,7 @@ def heat_flows(
     rise = cells - cells[0]
     return HeatFlows(
         simulation.batch_ids[b],
-        simulated,
+        True,
         simulation.time_s[b, :k],
         {h.law.name: joules[h.law.name] * h.direction(p[0]).sum() / spans_s for h in network.heats},
         {name: stored_J[:, c].sum(axis=1) / spans_s for name, c in network.bodies.items()},
@@ -139,10 +128,6 @@ def heat_flows(
         link,
         {name: rise[:, c].mean(axis=1) for name, c in network.bodies.items()},
     )
-
-
-def _n(network: Network) -> int:
-    return len(network.surroundings)
 
 
 def _fits(simulation: Simulation, inputs: Inputs, batch: int | str) -> tuple[int, int]:

@@ -232,14 +232,14 @@ def machine_modes(network: Network, factor: Array | None = None) -> Modes:
     return modes_of(network.capacity_J_per_K(values), conductance[:, None])
 
 
-def mode_views(network: Network, modes: Modes, rise_K: Array | None = None, regime: int = 0) -> list[ModeView]:
+def mode_views(network: Network, modes: Modes, rise_K: Array | None = None) -> list[ModeView]:
     """Every mode of the first parameter set, slowest first.
 
     Args:
         rise_K: the rise of all cells (N,) whose parts are wanted, say from the room's temperature to a steady state:
             each mode then brings ``row · shape_k (inverse_k · rise)`` with ``1 - exp(-t / tau_k)``. None: 1 K in all.
     """
-    shape, inverse = modes.shape[0, regime], modes.inverse[0, regime]
+    shape, inverse = modes.shape[0, 0], modes.inverse[0, 0]
     rise = np.ones(network.n_cells) if rise_K is None else np.asarray(rise_K, float)
     amplitude = inverse @ rise
     rows = np.array([e.matrix(network.values) for e in network.errors]).reshape(-1, network.n_cells)
@@ -248,7 +248,7 @@ def mode_views(network: Network, modes: Modes, rise_K: Array | None = None, regi
     capacity = network.capacity_J_per_K(network.values)
     channels = [e.channel for e in network.errors]
     out = []
-    for k, tau_s in enumerate(modes.time_constants_s(regime)[0]):
+    for k, tau_s in enumerate(modes.time_constants_s()[0, 0]):
         own = shape[:, k]
         own = own / own[np.abs(own).argmax()]
         weight = capacity * own**2 / (capacity * own**2).sum()

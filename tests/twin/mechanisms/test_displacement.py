@@ -10,34 +10,15 @@ from thermodrift.testing.small_machine import machine_with, network_with, part_w
 from twin.compile import compile_network, expanded
 from twin.mechanisms.base import View
 from twin.mechanisms.displacement import (
-    ColumnBending,
     JointSlip,
     MandrelFixture,
     ScrewElongation,
-    SpeedShift,
     SpindleGrowth,
 )
-
-OWN_UM_PER_K = 11.5 * 0.2  # of the chain that the small machine has anyway
 
 
 def z_um(network, **rise_K: float) -> float:
     return float(network.errors[0].matrix(network.values) @ [rise_K.get(name, 0.0) for name in network.cells])
-
-
-def test_bending_adds_gain_times_the_difference_of_the_sides():
-    network = network_with(ColumnBending(), {"gain": "-12 um/K"}, at={"hot": "second", "cold": "third"})
-    assert z_um(network, second=3.0, third=1.0) == pytest.approx(-24.0)
-
-
-def test_bending_of_a_uniform_warm_up_is_nothing():
-    network = network_with(ColumnBending(), {"gain": "-12 um/K"})
-    assert z_um(network, first=1.0, second=1.0, third=1.0) == pytest.approx(OWN_UM_PER_K)
-
-
-def test_growth_of_200_mm_of_steel_by_10_K_is_23_um():
-    network = network_with(SpindleGrowth(), {"gain": "2.3 um/K"}, at="second")
-    assert z_um(network, second=10.0) == pytest.approx(23.0)
 
 
 def test_each_error_gets_its_own_gain_with_its_prior():
@@ -76,51 +57,11 @@ def test_the_file_may_expose_the_bar_to_more_air():
         compile_network(machine)
 
 
-@pytest.mark.parametrize(
-    ("at", "told"),
-    [
-        (None, r"tried\.at: mandrel_fixture needs seat or air, got \[\]"),
-        ({"nest": "first"}, r"tried\.at: mandrel_fixture needs seat or air, got \['nest'\]"),
-        ({"air": "rom"}, r"tried\.at\.air: no body or surrounding 'rom'; did you mean 'room'\?"),
-        ({"seat": "room"}, r"tried\.at\.seat: no body 'room'"),
-    ],
-)
-def test_a_bar_that_is_nowhere(at, told):
-    with pytest.raises(InputError, match=told):
-        network_with(MandrelFixture(), at=at)
-
-
 def test_a_bar_of_a_body_s_name_is_refused():
     machine = machine_with(MandrelFixture())
     machine.twin["mechanisms"]["second"] = machine.twin["mechanisms"].pop("tried")
     with pytest.raises(InputError, match="a body is called 'second' already; give the mechanism another name"):
         compile_network(machine)
-
-
-@pytest.mark.parametrize(
-    ("instance", "told"),
-    [
-        ({"acts_on": "q"}, r"tried\.acts_on: no error 'q'; Allowed: z"),
-        ({"acts_on": None}, r"tried\.acts_on is missing; name the errors that column_bending moves"),
-        ({"at": {"hot": "first"}}, r"tried\.at: column_bending needs hot, cold, got \['hot'\]"),
-        ({"at": {"hot": "frist", "cold": "third"}}, r"tried\.at\.hot: no body 'frist'; did you mean 'first'\?"),
-        ({"at": {"hot": ["first", "second"], "cold": "third"}}, r"tried\.at\.hot: got 2 places, expected one"),
-        (
-            {"parameters": {"gian": 1}},
-            r"tried\.parameters: column_bending has no parameter 'gian'; did you mean 'gain'",
-        ),
-        ({"parameters": {"gain": "1 W/K"}}, r"gain: unit 'W/K' cannot be read as 'um/K'"),
-    ],
-)
-def test_mistakes_in_one_line(instance, told):
-    with pytest.raises(InputError, match=told):
-        network_with(ColumnBending(), **instance)
-
-
-def test_speed_shift_is_4_um_at_6000_and_a_ninth_at_2000():
-    view = View(driver={"speed": np.array([0.0, 2000.0, -6000.0])})
-    shift = SpeedShift().displacement(view, {"shift": np.array(4.0), "rated": np.array(6000.0)})
-    assert shift == pytest.approx([0.0, 4.0 / 9.0, 4.0])
 
 
 def screw(rise_K, position_mm, **p: float) -> np.ndarray:
@@ -129,15 +70,8 @@ def screw(rise_K, position_mm, **p: float) -> np.ndarray:
     return ScrewElongation().displacement(view, {k: np.array(v) for k, v in values.items()})
 
 
-def test_a_screw_grows_with_the_distance_from_its_fixed_end():
-    assert screw(8.0, [100.0, 600.0, -400.0]) == pytest.approx([0.0, 28.75, -28.75])
-
-
-def test_a_stretched_screw_first_loses_its_tension():
+def test_a_stretched_screw_first_loses_its_tension_and_one_held_at_one_end_shrinks_too():
     assert screw([-5.0, 0.0, 3.0, 4.0], 1100.0) == pytest.approx([0.0, 0.0, 0.0, 11.5])
-
-
-def test_a_screw_held_at_one_end_shrinks_too():
     assert screw([-2.0, 2.0], 1100.0, pretension=0.0) == pytest.approx([-23.0, 23.0])
 
 
@@ -146,19 +80,12 @@ def slip(rise_K, gain=2.0, limit=3.0) -> np.ndarray:
     return JointSlip().displacement(view, {"gain": np.array(gain), "limit": np.array(limit)})
 
 
-def test_a_joint_sticks_then_slips_then_takes_another_way_back():
+def test_a_joint_sticks_then_slips_whatever_the_sampling():
     assert slip([0.0, 1.0, 2.0, 5.0, 4.0, 2.0, 0.0]).tolist() == [0.0, 2.0, 3.0, 3.0, 1.0, -3.0, -3.0]
-
-
-def test_a_joint_that_never_slips_is_elastic():
     rise = np.array([0.0, 1.0, -1.0, 0.5])
     assert slip(rise, limit=1e9) == pytest.approx(2.0 * rise)
-
-
-def test_slip_does_not_depend_on_the_sampling():
-    time = np.linspace(0, 1, 1001)
-    rise = 6.0 * np.sin(2 * np.pi * time)
-    assert slip(rise)[::25] == pytest.approx(slip(rise[::25]), abs=1e-12)
+    fine = 6.0 * np.sin(2 * np.pi * np.linspace(0, 1, 1001))
+    assert slip(fine)[::25] == pytest.approx(slip(fine[::25]), abs=1e-12)
 
 
 def test_slip_of_many_sets_and_batches_at_once():

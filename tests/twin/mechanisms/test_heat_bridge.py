@@ -64,25 +64,6 @@ def test_it_becomes_a_link_with_its_value_and_prior() -> None:
     assert (p.value, p.spread, p.low, p.high) == (0.003, 0.7, 0.0, 1e5)
 
 
-@pytest.mark.parametrize(
-    "given, line",
-    [
-        ({"at": "first"}, "mechanisms.tried.at: expected the two bodies that exchange heat, e.g. at: {body: bed"),
-        ({"at": {"body": "first"}}, "mechanisms.tried.at: expected the two bodies"),
-        ({"at": {"body": "first", "other": "thrid"}}, "links.tried.between: no body 'thrid'; did you mean 'third'?"),
-        ({"at": {"body": "first", "other": "first"}}, "links.tried.between: both ends are 'first'"),
-        (
-            {"parameters": {"conductanse": "1 W/K"}},
-            "mechanisms.tried.parameters: heat_bridge has no parameter 'conductanse'; did you mean 'conductance'?",
-        ),
-    ],
-)
-def test_what_makes_no_sense_is_one_clear_line(given: dict[str, Any], line: str) -> None:
-    with pytest.raises(InputError) as told:
-        compile_network(machine(**given))
-    assert str(told.value).startswith(f"machine small: twin.{line}") and "\n" not in str(told.value)
-
-
 def test_a_link_of_the_same_name() -> None:
     taken = machine()
     stated(taken)["links"]["tried"] = {"between": ["first", "third"], "conductance": "1 W/K"}

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from data.errors import InputError
 from thermodrift.testing.small_machine import network_with
 from twin.mechanisms.base import View
 from twin.mechanisms.fluids import CoolantJacket, JacketChiller
@@ -120,15 +119,6 @@ def test_a_file_may_name_the_room_or_leave_it_out() -> None:
         for at, ports in ("first", {"jacket"}), ({"jacket": "first", "room": "room"}, {"jacket", "room"}):
             tried = next(h.law for h in network_with(law, {"supply": 18.0}, at=at).heats if h.law.name == "tried")
             assert set(tried.ports) == ports
-        with pytest.raises(InputError, match=r"tried\.at: \w+ needs jacket, room \(optional\), got \['room'\]"):
-            network_with(law, at={"room": "room"})
-
-
-def test_a_share_of_no_room_is_refused() -> None:
-    told = r"tried\.parameters\.follow: means nothing without at\.room; name that place"
-    for law in (JacketChiller(), CoolantJacket()):
-        with pytest.raises(InputError, match=told):
-            network_with(law, {"follow": 1.0}, at="first")
 
 
 def test_state_by_state_is_the_same_law() -> None:

@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
-from data.errors import InputError
-from thermodrift.testing.small_machine import network_with, part_with
+from thermodrift.testing.small_machine import part_with
 from twin.compile import expanded
 from twin.mechanisms.base import View
 from twin.mechanisms.sensors import (
-    SensorBonding,
-    SensorDrift,
     SensorLag,
-    SensorOffset,
     SensorQuantised,
-    SensorSelfHeat,
     SensorStuck,
     SensorSwap,
     TimeSkew,
 )
-from twin.mechanisms.surroundings import InitialState
 
 EVEN = np.arange(0.0, 601.0, 30.0)
 UNEVEN = np.array([0.0, 1.0, 5.0, 30.0, 31.0, 95.0, 300.0, 900.0])
@@ -37,17 +29,6 @@ def read(mechanism, seen, time_s, step_s=np.nan, degC=None, **p: float) -> np.nd
 def test_lag_of_a_ramp_is_exact(time_s, step_s):
     shown = read(SensorLag(), 20.0 + 0.01 * time_s, time_s, step_s, lag=60.0)
     assert shown == pytest.approx(20.0 + 0.01 * (time_s - 60.0 * (1.0 - np.exp(-time_s / 60.0))), abs=1e-12)
-
-
-def test_lag_of_an_uneven_course_meets_a_fine_integration():
-    fine = np.linspace(0.0, 900.0, 900_001)
-    seen = np.sin(UNEVEN / 80.0) * 5.0 + 20.0
-    course, y, out = np.interp(fine, UNEVEN, seen), seen[0], []
-    for a, b in pairwise(course):
-        y += 1e-3 / 45.0 * ((a + b) / 2 - y)
-        out.append(y)
-    expected = np.interp(UNEVEN, fine, [seen[0], *out])
-    assert read(SensorLag(), seen, UNEVEN, lag=45.0) == pytest.approx(expected, abs=1e-4)
 
 
 def test_even_steps_and_uneven_steps_are_the_same_law():
@@ -82,24 +63,6 @@ def test_a_pause_of_no_length_changes_nothing():
     assert np.isfinite(shown).all()
 
 
-def test_bonding_shows_95_percent_of_the_way_from_the_air():
-    assert read(SensorBonding(), 40.0, 0.0, degC={"air": np.array(20.0)}, bonding=0.95) == pytest.approx(39.0)
-
-
-def test_offset_drift_and_self_heat_add():
-    time_s = np.array([0.0, 7200.0])
-    assert read(SensorOffset(), [20.0, 30.0], time_s, offset=-0.3) == pytest.approx([19.7, 29.7])
-    assert read(SensorDrift(), [20.0, 30.0], time_s, rate=0.05) == pytest.approx([20.0, 30.1])
-    assert read(SensorSelfHeat(), [20.0, 30.0], time_s, excess=0.2) == pytest.approx([20.2, 30.2])
-
-
-def test_a_start_above_the_first_reading_goes_into_the_named_body():
-    network = network_with(InitialState(), {"excess": "3 K"}, into="second")
-    law, cells = network.starts[0]
-    assert cells.tolist() == [0.0, 1.0, 0.0]
-    assert law.mechanism.start_K(View(), {"excess": np.array(3.0)}) == 3.0
-
-
 def test_a_swap_exchanges_all_that_belongs_to_a_sensor():
     part = part_with(SensorSwap(), acts_on=["first", "third"])
     lagging = part.sensors["first"].model_copy(update={"words": "the late one"})
@@ -109,19 +72,6 @@ def test_a_swap_exchanges_all_that_belongs_to_a_sensor():
     assert swapped.sensors["third"].words == "the late one"
     assert list(swapped.sensors) == list(part.sensors)
     assert "tried" not in swapped.mechanisms
-
-
-@pytest.mark.parametrize(
-    ("on", "told"),
-    [
-        (["first"], r"tried\.acts_on: got \['first'\], expected the two sensors that are exchanged"),
-        (["first", "first"], r"expected the two sensors that are exchanged"),
-        (["first", "secnd"], r"tried\.acts_on: no sensor 'secnd'; did you mean 'second'\?"),
-    ],
-)
-def test_a_swap_of_something_else(on, told):
-    with pytest.raises(InputError, match=told):
-        network_with(SensorSwap(), acts_on=on)
 
 
 def test_a_stuck_sensor_keeps_its_value():

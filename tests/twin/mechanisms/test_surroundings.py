@@ -103,19 +103,6 @@ def test_other_mechanisms_may_use_what_was_added() -> None:
     np.testing.assert_array_equal(network.heats[0].direction(network.values), [0, 0, 0, 1])
 
 
-def test_floor_sink_follows_the_season_in_part() -> None:
-    sink = {"law": "floor_sink", "at": "bed", "parameters": {"conductance": "10 W/K", "temperature": "17 degC"}}
-    network = compile_network(machine("room", floor=sink))
-    floor = next(s for s in network.surroundings if s.name == "floor")
-    assert floor.first == ("room",)
-    assert network.values[[floor.value, floor.follow]].tolist() == [17.0, 0.5]
-    np.testing.assert_allclose(network.surrounding_W_per_K(network.values)[1], [0, 0, 10])
-    # in winter the ground warms the bed, in summer it cools it
-    for room, ground in ((5.0, 11.0), (30.0, 23.5)):
-        bed = settled_degC(network, {}, {"room": room, "floor": ground})["bed"]
-        assert np.sign(bed - room) == np.sign(ground - room)
-
-
 def test_floor_sink_at_a_place_and_beside_a_named_room() -> None:
     sink = {"law": "floor_sink", "at": {"body": "bed", "room": "room"}}
     part = expanded(twin_part(machine("hall", "room", ground=sink)))
