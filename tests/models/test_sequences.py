@@ -1,5 +1,7 @@
 """Batches as thinned sequences: every row once, nothing from later, nothing across a border."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -41,7 +43,7 @@ def test_holes_are_held_and_what_a_batch_lacks_stays_nan_and_unknown() -> None:
     design = make_design()
     x, y_um = design.x.copy(), design.y_um.copy()
     x[2, 0], x[7:, 1], y_um[4] = np.nan, np.nan, np.nan
-    holed = Design(design.inputs, "z", design.batch_ids, x, y_um, design.time_s, design.offsets, 60.0)
+    holed = replace(design, x=x, y_um=y_um)
     s = Sequences.of(holed, 1)
     assert s.x[0, 0, 2, 0] == x[1, 0]
     assert np.isnan(s.x[1, 0, :5, 1]).all()
@@ -83,8 +85,7 @@ def test_memory_columns_are_the_inputs_and_how_far_their_lags_are_behind() -> No
 
 def test_linear_memory_recovers_a_law_of_lagged_inputs() -> None:
     design = make_design((60, 50, 55, 60), p=2)
-    design = Design(design.inputs, "z", design.batch_ids, np.cumsum(design.x, axis=0), design.y_um, design.time_s,
-                    design.offsets, 60.0)  # fmt: skip
+    design = replace(design, x=np.cumsum(design.x, axis=0))
     s = Sequences.of(design, 1)
     columns = memory_columns(s.x)
     law = np.random.default_rng(1).normal(size=columns.shape[-1])

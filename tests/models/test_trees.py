@@ -1,5 +1,7 @@
 """Forests and boosted trees: the plain walk against scikit-learn's prediction, and what a bag of batches is worth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sklearn.ensemble import HistGradientBoostingRegressor
@@ -76,7 +78,7 @@ def test_a_missing_input_is_no_prediction_and_far_away_is_the_edge(cls: type[Fam
     x = design.x.copy()
     x[3, 1] = np.nan
     x[5], x[6] = 50.0, 5000.0
-    other = Design(design.inputs, "z", design.batch_ids, x, design.y_um, design.time_s, design.offsets, 300.0)
+    other = replace(design, x=x)
     got = fitted.predict_design(other, [0])[0]
     assert np.isnan(got[3]) and np.isfinite(np.delete(got, 3)).all()
     assert got[5] == got[6]
