@@ -45,18 +45,16 @@ class Doubt:
 class Filtered:
     """What is known at every row from the readings up to it; B batches, K rows.
 
-    errors (B, K, n_errors) and error_sd in the channels' units, 0 at the first row; cells_degC (B, K, N); heat_factor
-    (B, K, n_heats) less 1; innovation (B, K, n_sensors): what each reading adds to what was known, over its standard
-    deviation, one sensor after the other, NaN where there is none; log_likelihood (B,) of the readings.
+    errors (B, K, n_errors) in the channels' units, 0 at the first row; cells_degC (B, K, N); heat_factor (B, K,
+    n_heats) less 1; innovation (B, K, n_sensors): what each reading adds to what was known, over its standard
+    deviation, one sensor after the other, NaN where there is none.
     """
 
     network: Network
     errors: Array
-    error_sd: Array
     cells_degC: Array
     heat_factor: Array
     innovation: Array
-    log_likelihood: Array
 
 
 @dataclass(frozen=True)
@@ -130,8 +128,7 @@ def _run(
     cov = linear.first(doubt, n_cells, n_heats)
     state = np.zeros(cov.shape[:2])
     states = np.empty((*given.shape[:2], cov.shape[-1]))
-    error_var = np.empty((*given.shape[:2], len(network.errors)))
-    news, likelihood = np.full(given.shape, np.nan), np.zeros(len(given))
+    news = np.full(given.shape, np.nan)
     for k in range(given.shape[1]):
         if k:
             move = linear.move[:, k - 1]
@@ -150,11 +147,7 @@ def _run(
             state = state + (own_news[:, None] @ gain)[:, 0]
             cov = cov - gain.swapaxes(-1, -2) @ gain
             news[:, k] = np.where(there[:, k], own_news, np.nan)
-            each = 0.5 * (own_news**2 + np.log(2 * np.pi)) + np.log(np.einsum("bii->bi", root))
-            likelihood -= np.where(there[:, k], each, 0.0).sum(axis=1)
         states[:, k] = state
-        row = linear.error[:, k]
-        error_var[:, k] = np.einsum("bei,bij,bej->be", row, cov, row)
     innovation = np.full(readings.shape, np.nan)
     innovation[:, ::thin, used] = news
     held = np.arange(readings.shape[1]) // thin
@@ -163,11 +156,9 @@ def _run(
     return Filtered(
         network,
         nominal.errors[0] + moved,
-        np.sqrt(np.maximum(error_var, 0.0))[:, held],
         nominal.cells_degC[0] + states[..., :n_cells],
         states[..., n_cells : n_cells + n_heats],
         innovation,
-        likelihood,
     )
 
 

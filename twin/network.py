@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -197,11 +197,6 @@ class Network:
     def n_cells(self) -> int:
         return len(self.cells)
 
-    @property
-    def linear(self) -> bool:
-        """Whether no heat depends on temperature."""
-        return not any(h.temperature_dependent and not h.asleep for h in self.heats)
-
     def index(self, name: str) -> int:
         """Number of a parameter.
 
@@ -246,10 +241,3 @@ class Network:
                 g = self.edge_W_per_K(edge, values, factor)
                 out[..., edge.surrounding, :] += g[..., None] * edge.direction
         return out
-
-    def with_values(self, values: Sequence[float] | Array) -> Network:
-        """The same network whose parameters have these values."""
-        from dataclasses import replace
-
-        changed = tuple(replace(p, value=float(v)) for p, v in zip(self.parameters, values, strict=True))
-        return replace(self, parameters=changed)

@@ -52,10 +52,8 @@ def no_readings(network: Network, given: Inputs) -> np.ndarray:
     return np.full((given.n_batches, given.time_s[0, :: given.every].size, len(network.readings)), np.nan)
 
 
-def textbook(
-    network: Network, readings: np.ndarray, start_degC: np.ndarray, doubt: Doubt, lag_s: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """z and its standard deviation by a dense filter on absolute temperatures: shaft, head, factor, lag, z(0)."""
+def textbook(network: Network, readings: np.ndarray, start_degC: np.ndarray, doubt: Doubt, lag_s: float) -> np.ndarray:
+    """z by a dense filter on absolute temperatures: shaft, head, factor, lag, z(0)."""
     p = {q.name: q.value for q in network.parameters}
     c = np.array([p["bodies.shaft.capacity"], p["bodies.head.capacity"]])
     g, shaft, head = (
@@ -77,7 +75,7 @@ def textbook(
     seen = np.array([[0, 0, 0, 1, 0], [0, 1, 0, 0, 0]], float)
     read = np.array([*gain, 0, 0, -1.0])
     given = inputs()
-    z, sd = [], []
+    z = []
     for k in range(ROWS):
         if k:
             watts = belt_W if given.drivers["rpm"][0, k - 1] else 0.0
@@ -104,8 +102,7 @@ def textbook(
             state = state + kalman @ (readings[k][there] - h @ state)
             cov = (np.eye(5) - kalman @ h) @ cov
         z.append(read @ state if k else 0.0)
-        sd.append(np.sqrt(read @ cov @ read) if k else 0.0)
-    return np.array(z), np.array(sd)
+    return np.array(z)
 
 
 def truth(network: Network, given: Inputs, start_degC: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -127,9 +124,8 @@ def test_is_the_textbook_filter_on_two_bodies_with_missing_rows(lag_s, atol_um):
     readings[0, 50:70] = np.nan
     start = np.array([20.0, 21.0])
     got = filtered(network, given, readings, doubt, start[None])
-    z, sd = textbook(network, readings[0], start, doubt, lag_s)
+    z = textbook(network, readings[0], start, doubt, lag_s)
     np.testing.assert_allclose(got.errors[0, :, 0], z, atol=atol_um)
-    np.testing.assert_allclose(got.error_sd[0, :, 0], sd, rtol=1e-3, atol=1e-3)
 
 
 def test_without_readings_it_runs_free():
@@ -138,7 +134,7 @@ def test_without_readings_it_runs_free():
     got = filtered(network, given, no_readings(network, given), Doubt(np.eye(2)), start)
     free = simulate(network, network.values, given, start[None])
     np.testing.assert_allclose(got.errors, free.errors[0], atol=1e-9)
-    assert np.isnan(got.innovation).all() and got.log_likelihood[0] == 0.0
+    assert np.isnan(got.innovation).all()
 
 
 @pytest.mark.parametrize("network", [two_bodies(), with_grease()], ids=["linear", "grease"])
@@ -158,7 +154,7 @@ def test_innovation_is_white_and_of_unit_variance_where_model_and_noise_are_righ
             assert abs(r) < 4 / np.sqrt(n)
 
 
-def test_beats_free_running_from_a_wrong_start_and_its_sd_tells_how_well():
+def test_beats_free_running_from_a_wrong_start():
     network, given = with_grease(), inputs(batches=20)
     rng = np.random.default_rng(5)
     start_K2 = np.diag([9.0, 9.0])
@@ -169,8 +165,6 @@ def test_beats_free_running_from_a_wrong_start_and_its_sd_tells_how_well():
     free = simulate(network, network.values, given, guess[None]).errors[0]
     wrong, right = errors - free, errors - got.errors
     assert np.sqrt(np.mean(right**2)) < 0.1 * np.sqrt(np.mean(wrong**2))
-    inside = np.abs(right[:, 1:, 0]) < 1.645 * got.error_sd[:, 1:, 0]
-    assert 0.8 < inside.mean() < 0.97
 
 
 def test_finds_a_heat_that_is_stronger_than_the_file_says():

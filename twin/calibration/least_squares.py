@@ -24,10 +24,9 @@ MOST_DAMPING = 1e12
 
 @dataclass(frozen=True)
 class Step:
-    """One accepted step: the cost after it, the damping it took and how many tries were rejected before."""
+    """One accepted step: the cost after it and how many tries were rejected before."""
 
     cost: float
-    damping: float
     rejected: int
 
 
@@ -116,7 +115,7 @@ def descend(problem: Problem, state: State, max_iterations: int, tolerance: floa
             damping, growth = max(1.0, damping * growth), growth * 2
             if damping > MOST_DAMPING:
                 return replace(state, stuck=True)
-        history = [*state.history, Step(moved.cost, damping, rejected)]
+        history = [*state.history, Step(moved.cost, rejected)]
         state = replace(moved, history=history)
         damping *= max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3)
         damping = 0.0 if damping < 1e-3 else damping
@@ -226,15 +225,14 @@ NOISE_ROUNDS = 10
 class Fit:
     """The optimum and what is known about it; p parameters, B batches, c channels.
 
-    `covariance` (p, p) of x: the inverse of the data's information plus the prior's, nuisances marginalised;
-    `information_data` (p, p) without the prior. `dof`: rows less the parameters and nuisances that the data determine.
+    `covariance` (p, p) of x: the inverse of the data's information plus the prior's, nuisances marginalised.
+    `dof`: rows less the parameters and nuisances that the data determine.
     `noise_factor` and `inflation` (c,) divide the information, see `Noise`; ones without re-estimation.
     """
 
     x: Array
     nuisance: list[Array]
     covariance: Array
-    information_data: Array
     cost: float
     history: tuple[Step, ...]
     converged: bool
@@ -411,12 +409,10 @@ def result(problem: Problem, state: State, tolerance: float, notes: str) -> Fit:
     if at_bound:
         notes += f"; at its bound: {', '.join(at_bound)}"
     spread = np.array([u.spread for u in unknowns])
-    scale = np.outer(spread, spread)
     return Fit(
         x=x,
         nuisance=state.nuisance,
-        covariance=state.arrow.covariance * scale,
-        information_data=state.arrow.information / scale,
+        covariance=state.arrow.covariance * np.outer(spread, spread),
         cost=state.cost,
         history=tuple(state.history),
         converged=converged,

@@ -151,16 +151,9 @@ def inside(scope: Scope, name: str) -> list[Edge]:
         (number[:-1], number[1:], along.times(nx / ny)),
         (number[:, :-1], number[:, 1:], across.times(ny / nx)),
     ):
-        edges += [
-            Edge(name, _from_to(scope, i, j), g) for i, j in zip(a.ravel().tolist(), b.ravel().tolist(), strict=True)
-        ]
+        unit = np.eye(len(scope.cells))
+        edges += [Edge(name, unit[i] - unit[j], g) for i, j in zip(a.ravel(), b.ravel(), strict=True)]
     return edges
-
-
-def _from_to(scope: Scope, i: int, j: int) -> Array:
-    d = np.zeros(len(scope.cells))
-    d[i], d[j] = 1.0, -1.0
-    return d
 
 
 def link(scope: Scope, name: str) -> list[Edge]:
@@ -183,7 +176,8 @@ def link(scope: Scope, name: str) -> list[Edge]:
 
 
 def _joint(scope: Scope, key: str, area: Value | None, coefficient: Value | None) -> Monomial:
-    return scope.table.product((f"{key}.area", AREA, area, 1.0), (f"{key}.coefficient", COEFFICIENT, coefficient, 1.0))
+    factors = ("area", AREA, area), ("coefficient", COEFFICIENT, coefficient)
+    return Monomial(1.0, tuple((scope.table.add(f"{key}.{name}", spec, given), 1.0) for name, spec, given in factors))
 
 
 def exposure(scope: Scope, name: str) -> list[Edge]:

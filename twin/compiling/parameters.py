@@ -45,10 +45,6 @@ class ParameterTable:
         """The parameter by itself."""
         return Monomial(1.0, ((self.add(path, spec, given), 1.0),))
 
-    def product(self, *factors: tuple[str, Spec, Value | None, float], const: float = 1.0) -> Monomial:
-        """``const * prod(parameter ** exponent)`` over (path, spec, value, exponent)."""
-        return Monomial(const, tuple((self.add(path, spec, given), e) for path, spec, given, e in factors))
-
     def material(self, name: str | None, quantity: str, key: str) -> int:
         """A material's property, shared by all that are made of it.
 
