@@ -1,7 +1,5 @@
 """The BP net and its trainer: gradient, optimum, bounds, seeds."""
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +7,6 @@ import pytest
 import torch
 from threadpoolctl import threadpool_limits
 
-from data.errors import InputError
 from features.design import Design
 from features.levenberg_marquardt import jacobian, outputs, train
 from features.nets import Nets
@@ -81,22 +78,6 @@ def test_first_step_is_the_damped_gauss_newton_step():
         step = np.linalg.solve(left, slopes[s] @ error[s] / n - penalty * first.parameters[s])
         np.testing.assert_allclose(got.parameters[s] - first.parameters[s], step, atol=1e-9)
     assert steps.tolist() == [1, 1, 1]
-
-
-def test_a_trained_model_predicts_without_torch(tmp_path):
-    model = BP().as_published().fit_design(make_design(), [0, 1])
-    np.savez(tmp_path / "net.npz", **model.fitted)
-    code = (
-        "import sys, numpy as np; from models.base import family_from_plain; from features.design import Design; "
-        "fitted = dict(np.load(sys.argv[1])); plain = dict(family='bp', options={}, inputs=['t0', 't1'], target='z'); "
-        "model = family_from_plain(plain | dict(fitted=fitted)); x = np.array([[0.0, 0.0], [1.0, 2.0]]); "
-        "design = Design(('t0', 't1'), '', ('a',), x, x[:, 0], x[:, 0], np.array([0, 2])); "
-        "print(float(model.predict_design(design, [0])[0][1]), 'torch' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "net.npz")], capture_output=True, text=True)
-    x = np.array([[0.0, 0.0], [1.0, 2.0]])
-    want = model.predict_design(Design(("t0", "t1"), "", ("a",), x, x[:, 0], x[:, 0], np.array([0, 2])), [0])[0][1]
-    assert done.stdout.split() == [str(float(want)), "False"], done.stderr
 
 
 def test_torch_keeps_its_thread_count():
@@ -189,12 +170,6 @@ def test_a_sensor_that_never_moved_and_a_flat_error_do_no_harm():
         assert np.abs(part).max() < 1.0
 
 
-def test_too_few_rows_in_words():
-    design = make_design()
-    with pytest.raises(InputError, match="family bp: got 0 usable rows of z in no batch, need at least 2"):
-        BP().as_published().fit_design(design, [])
-
-
 def test_linear_transfer_is_least_squares_with_a_penalty_on_the_length_of_the_slope():
     """min mean (y − c − x·β)² + 2 decay |β| is convex: at its one minimum mean x (y − ŷ) = decay β / |β|."""
     rng = np.random.default_rng(0)
@@ -229,9 +204,3 @@ def test_linear_transfer_cannot_bend():
         )
         left[transfer] = np.std(model.predict_design(design, [3])[0] - design.y_um[design.rows(3)])
     assert left["tanh"] < 0.2 * left["linear"]
-
-
-def test_an_unknown_transfer_in_words():
-    words = r"^family bp: unknown transfer 'tan': did you mean 'tanh'\? Allowed: linear, tanh$"
-    with pytest.raises(InputError, match=words):
-        BP(transfer="tan")

@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 
 from data.batch import Batch, Channel
-from data.errors import InputError
 from features.design import Design
 from features.rises import first_order_lag
 from models.distributed_lag import KOYCK_TAUS_S, DistributedLag
@@ -257,16 +256,6 @@ def test_shapes():
     assert [len(s.responses) for s in free_shapes(5)] == [1, 2, 3, 4, 5, 6]
     assert [s.mix.shape for s in polynomial_shapes(4, 2)] == [(1, 1), (2, 2), (3, 3), (4, 3), (5, 3)]
     assert [s.responses for s in koyck_shapes(2)] == [(0,), (0, 1), (0, 2)]
-
-
-@pytest.mark.parametrize(("options", "words"), [
-    ({"lags": "almond"}, "unknown lags 'almond': did you mean 'almon'"),
-    ({"order_by": "bix"}, "unknown order_by 'bix': did you mean 'bic'"),
-    ({"lag_min": 0}, "expected lag_min above 0"),
-])  # fmt: skip
-def test_impossible_options_are_told(options, words):
-    with pytest.raises(InputError, match=words):
-        DistributedLag(**options)
 
 
 def drifting_runs(n_runs=9, n=48, step_s=300.0) -> list[Batch]:

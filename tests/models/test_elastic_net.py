@@ -7,7 +7,6 @@ import pytest
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import ElasticNet as SkElasticNet
 
-from data.errors import InputError
 from features.design import Design
 from models.elastic_net import ElasticNet
 from models.linear import Blocks
@@ -141,9 +140,3 @@ def test_n_active_counts_what_is_left():
     design = make_design(7)
     for model in ElasticNet((1.0,), 0.05, 4).as_published().fit_folds(design, FOLDS):
         assert model.fitted["n_active"] == np.count_nonzero(model.fitted["coef_um_per_K"])
-
-
-@pytest.mark.parametrize("options", [{"mixings": ()}, {"mixings": (0.0,)}, {"least": 0}, {"n_penalties": 0}])
-def test_impossible_options_are_told(options):
-    with pytest.raises(InputError, match="expected mixings above 0 and at most 1"):
-        ElasticNet(**options)

@@ -145,16 +145,3 @@ def test_holes_are_bridged_and_a_missing_input_is_nan():
     x[120:, 1] = np.nan
     dead = Design(design.inputs, "z", design.batch_ids, x, y, design.time_s, design.offsets, 60.0)
     assert np.isnan(model.predict_design(dead, [2])[0][1:]).all()
-
-
-def test_a_free_run_never_reads_the_error():
-    design = generated(0.3, [1.0], [30, 30])
-    model = GM1N().fit_design(design, [0])
-    blind = Design(design.inputs, "z", design.batch_ids, design.x, np.full(60, np.nan), design.time_s,
-                   design.offsets, 60.0)  # fmt: skip
-    np.testing.assert_array_equal(model.predict_design(blind, [1])[0], model.predict_design(design, [1])[0])
-
-
-def test_unknown_response():
-    with pytest.raises(InputError, match="did you mean 'whitening'"):
-        GM1N("whitenin")

@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 
 from data.batch import Batch, Channel
-from data.errors import InputError
 from features.design import Design
 from models.distributed_lag import DistributedLag
 from models.gm1n import GM1N
@@ -163,14 +162,3 @@ def test_folds_at_once_are_the_folds_alone_in_bands_too():
             assert alone.fitted["band_batches"] == model.fitted["band_batches"]
             for a, b in zip(alone.predict_design(design, [0, 5]), model.predict_design(design, [0, 5]), strict=True):
                 np.testing.assert_allclose(a, b, atol=1e-6)
-
-
-@pytest.mark.parametrize(("options", "words"), [
-    ({"banded": "bath"}, "unknown banded 'bath': did you mean 'both'"),
-    ({"bands": 0}, "bands 0, least_batches 4; expected at least 1"),
-    ({"lags": "fee"}, "unknown lags 'fee': did you mean 'free'"),
-    ({"response": "white"}, "unknown response 'white'"),
-])  # fmt: skip
-def test_impossible_options_are_told(options, words):
-    with pytest.raises(InputError, match=words):
-        GMDL(**options)

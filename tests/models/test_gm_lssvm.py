@@ -182,16 +182,6 @@ def test_a_length_that_cannot_be_is_told(lengths):
         sequence_outputs(x, y, range(15, 55), lengths)
 
 
-@pytest.mark.parametrize(("options", "words"), [
-    ({"lengths_in": "mins"}, "unknown lengths_in 'mins': did you mean 'min'"),
-    ({"lengths": ()}, "expected at least one, above 0 rows"),
-    ({"tuning": "swarm"}, "unknown tuning 'swarm'"),
-])  # fmt: skip
-def test_impossible_options_are_told(options, words):
-    with pytest.raises(InputError, match=words):
-        GMLSSVM(**options)
-
-
 def test_a_layer_is_a_design_of_its_own():
     design = make_design()
     outputs = np.where(design.group[:, None] == 1, design.x, np.nan)

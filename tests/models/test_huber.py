@@ -5,7 +5,6 @@ import pytest
 from scipy.optimize import minimize
 from sklearn.linear_model import HuberRegressor
 
-from data.errors import InputError
 from features.design import Design
 from models.huber import Huber
 from models.mlr import MLR
@@ -139,9 +138,3 @@ def test_inputs_of_another_unit_are_scaled_so_that_their_unit_does_not_matter():
                    plain.offsets, 300.0, input_units=plain.input_units)  # fmt: skip
     a, b = (Huber(ridge=0.1).as_published().fit_design(d, range(K)).predict_design(d, [0])[0] for d in (plain, other))
     np.testing.assert_allclose(a, b, atol=1e-6)
-
-
-@pytest.mark.parametrize("options", [{"epsilons": ()}, {"epsilons": (1.0,)}, {"ridge": 0.0}])
-def test_impossible_options_are_told(options):
-    with pytest.raises(InputError, match="expected epsilons above 1"):
-        Huber(**options)

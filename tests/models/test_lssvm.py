@@ -197,20 +197,6 @@ def test_the_swarm_finds_at_least_what_the_grid_finds_and_its_score_is_that_of_r
     np.testing.assert_array_equal(again.fitted["alpha"], swarm.fitted["alpha"])
 
 
-def test_an_unknown_tuning_is_told():
-    with pytest.raises(InputError, match="lssvm: unknown tuning 'swarm'"):
-        LSSVM(tuning="swarm")
-
-
-def test_left_out_batch_changes_nothing():
-    design = make_design(5)
-    other = Design(design.inputs, "z", design.batch_ids, design.x, np.where(design.group == 2, 99.0, design.y_um),
-                   design.time_s, design.offsets, 60.0)  # fmt: skip
-    folds = [[0, 1, 3, 4], [0, 1, 2, 3]]
-    a, b = (LSSVM(**SMALL).as_published().fit_folds(d, folds)[0] for d in (design, other))
-    np.testing.assert_allclose(a.predict_design(design, [2])[0], b.predict_design(design, [2])[0], atol=1e-7)
-
-
 def test_the_linear_part_goes_on_where_the_rbf_falls_back_to_its_bias():
     x = np.linspace(0, 10, 60)[:, None]
     far = np.linspace(60, 70, 5)[:, None]
@@ -240,14 +226,6 @@ def test_missing_rows_train_nothing_and_predict_nan():
     assert len(model.fitted["alpha"]) == sum(SIZES) - 2
     assert np.isfinite(model.fitted["alpha"]).all()
     assert np.flatnonzero(np.isnan(np.concatenate(model.predict_design(holed, range(5))))).tolist() == [3]
-
-
-def test_too_few_rows_in_words():
-    design = make_design(8)
-    empty = Design(design.inputs, "z", design.batch_ids, design.x, np.full(len(design.x), np.nan), design.time_s,
-                   design.offsets, 60.0)  # fmt: skip
-    with pytest.raises(InputError, match="family lssvm: got 0 usable rows of z in K2, K3, need at least 2"):
-        LSSVM().as_published().fit_design(empty, [1, 2])
 
 
 def test_inputs_beyond_any_scale_are_refused_in_words():

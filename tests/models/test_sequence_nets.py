@@ -1,7 +1,5 @@
 """Nets along whole batches: slopes, stacks, rest, causality, planted laws."""
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -187,19 +185,6 @@ def test_a_machine_at_rest_is_told_its_intercept(Net):
     np.testing.assert_allclose(model.predict_design(still, [0])[0], model.fitted["intercept_um"], atol=1e-12)
 
 
-def test_no_row_sees_a_later_one(Net):
-    design = plant(bent_law)
-    model = Net().fit_design(design, range(4))
-    before = model.predict_design(design, [5])[0]
-    for row in (10, 33):
-        x = design.x.copy()
-        x[design.rows(5)][row:] += 5.0
-        changed = Design(design.inputs, "z", design.batch_ids, x, design.y_um, design.time_s, design.offsets, STEP_S)
-        after = model.predict_design(changed, [5])[0]
-        np.testing.assert_array_equal(after[:row], before[:row])
-        assert abs(after[row] - before[row]) > 0.1
-
-
 def recorded(x, step_s, ids=("K1",)) -> Design:
     n = len(x)
     return Design(("a", "b"), "", ids, x, np.full(n, np.nan), np.arange(n) * step_s, np.array([0, n]), step_s)
@@ -331,20 +316,3 @@ def test_torch_keeps_its_thread_count_and_a_result_does_not_depend_on_it(Net):
     finally:
         torch.set_num_threads(before)
     np.testing.assert_array_equal(told[0], told[1])
-
-
-def test_a_trained_net_predicts_without_torch(tmp_path):
-    model = GRU(epochs=3).fit_design(plant(bent_law), range(4))
-    arrays = {name: value for name, value in model.fitted.items() if name != "drivers"}
-    np.savez(tmp_path / "net.npz", **arrays)
-    code = (
-        "import sys, numpy as np; from models.base import family_from_plain; from features.design import Design; "
-        "fitted = dict(np.load(sys.argv[1])) | dict(drivers=[]); "
-        "plain = dict(family='gru', options={}, inputs=['a', 'b'], target='z', fitted=fitted, zero_start=True); "
-        "x = np.arange(18.0).reshape(9, 2); t = np.arange(9) * 300.0; "
-        "design = Design(('a', 'b'), '', ('K1',), x, t, t, np.array([0, 9]), 300.0); "
-        "print(float(family_from_plain(plain).predict_design(design, [0])[0][8]), 'torch' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "net.npz")], capture_output=True, text=True)
-    want = model.predict_design(recorded(np.arange(18.0).reshape(9, 2), STEP_S), [0])[0][8]
-    assert done.stdout.split() == [str(float(want)), "False"], done.stderr

@@ -1,13 +1,9 @@
 """Support vector regression against scikit-learn's own, the conditions of its optimum, and a law it must find."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from sklearn.svm import SVR as LibSVR
 
-from data.errors import InputError
 from features.design import Design
 from models.svr import SVR
 
@@ -124,28 +120,3 @@ def test_far_outside_it_falls_back_to_its_bias():
 def test_units_have_their_own_scale():
     design = make_design(6, units=("rpm", "K"))
     np.testing.assert_array_equal(SVR(**ONE).as_published().fit_design(design, [0, 1]).fitted["scale"], [1000.0, 10.0])
-
-
-def test_a_trained_model_predicts_without_scikit_learn():
-    code = (
-        "import sys, numpy as np\n"
-        "from features.design import Design\n"
-        "from models.base import family_from_plain\n"
-        "x, none = np.arange(3.0)[:, None], np.full(3, np.nan)\n"
-        "design = Design(('t',), '', ('K1',), x, none, np.arange(3.0), np.array([0, 3]))\n"
-        "fitted = {'support': np.ones((1, 1)), 'alpha': np.ones(1), 'bias': 0.0, 'sigma': 1.0, 'scale': np.ones(1)}\n"
-        "plain = {'family': 'svr', 'options': {}, 'inputs': ['t'], 'target': 'z', 'fitted': fitted}\n"
-        "model = family_from_plain(plain)\n"
-        "model.predict_design(design, [0])\n"
-        "sys.exit('sklearn' in sys.modules)\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_too_few_rows_and_impossible_options_are_told():
-    design = make_design(7)
-    design.y_um[:] = np.nan
-    with pytest.raises(InputError, match="family svr: got 0 usable rows of z in K2, K3, need at least 2"):
-        SVR().as_published().fit_design(design, [1, 2])
-    with pytest.raises(InputError, match=r"svr: max_rows 1,.* expected at least 2 rows and values above 0"):
-        SVR(max_rows=1)

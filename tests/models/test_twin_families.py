@@ -59,18 +59,6 @@ def test_learns_what_the_file_has_wrong_and_predicts_to_the_noise():
     assert np.ptp(given.y_um[given.rows(5)]) > 15.0
 
 
-@pytest.mark.parametrize("family", [Twin, TwinResidual])
-def test_a_prediction_sees_neither_displacement_nor_later_temperatures(family):
-    given = design()
-    model = family().fit_design(given, range(5))
-    batch = BATCHES[5]
-    want = model.predict(batch)
-    blind = changed(batch, z=np.nan, x=np.nan)
-    np.testing.assert_array_equal(model.predict(blind), want)
-    hot = {n: batch.table[n] + np.where(np.arange(ROWS) > 30, 9.0, 0.0) for n in INPUTS}
-    np.testing.assert_array_equal(model.predict(changed(batch, **hot))[:31], want[:31])
-
-
 def test_the_twin_sees_no_temperature_of_the_machine_at_all():
     model = Twin().fit_design(design(), range(5))
     want = model.predict(BATCHES[5])
