@@ -69,11 +69,12 @@ class SVR(KernelExpansion):
         sigma, cost, epsilon, inner_rms_um = self._chosen(design, self._kept(design, train, self.max_rows // 2), scale)
         u, y_um = design.x[rows] / scale, design.y_um[rows]
         mean_um, spread_um = float(y_um.mean()), float(y_um.std()) or 1.0
-        found = _fitted(kernel(u, u, sigma, False), (y_um - mean_um) / spread_um, cost, epsilon, _STEPS_FIT)
+        target = (y_um - mean_um) / spread_um
+        support, alpha, bias = _fitted(kernel(u, u, sigma, False), target, cost, epsilon, _STEPS_FIT)
         fitted = {
-            "support": u[found.support],
-            "alpha": spread_um * found.alpha,
-            "bias": mean_um + spread_um * found.bias,
+            "support": u[support],
+            "alpha": spread_um * alpha,
+            "bias": mean_um + spread_um * bias,
             "sigma": sigma,
             "C": cost / len(rows),
             "epsilon": epsilon,
@@ -119,22 +120,14 @@ class _Left:
         if not len(self.y_um):
             return float(np.sqrt(np.mean(self.left_um**2)))
         mean_um, spread_um = self.y_um.mean(), self.y_um.std() or 1.0
-        found = _fitted(self.inside, (self.y_um - mean_um) / spread_um, cost, epsilon, _STEPS_CHOICE)
-        predicted = mean_um + spread_um * (self.outside[:, found.support] @ found.alpha + found.bias)
+        target = (self.y_um - mean_um) / spread_um
+        support, alpha, bias = _fitted(self.inside, target, cost, epsilon, _STEPS_CHOICE)
+        predicted = mean_um + spread_um * (self.outside[:, support] @ alpha + bias)
         return float(np.sqrt(np.mean((self.left_um - predicted) ** 2)))
 
 
-@dataclass(frozen=True)
-class _Found:
-    """Support rows, their weights, and the bias."""
-
-    support: Rows
-    alpha: Array
-    bias: float
-
-
-def _fitted(omega: Array, y: Array, cost: float, epsilon: float, steps: int) -> _Found:
-    """libsvm's solution for the kernel matrix; a scaled error y, C = cost/n.
+def _fitted(omega: Array, y: Array, cost: float, epsilon: float, steps: int) -> tuple[Rows, Array, float]:
+    """libsvm's support rows, their weights and the bias for the kernel matrix; a scaled error y, C = cost/n.
 
     scikit-learn keeps this function private; its estimator takes more time to check its arguments than to solve a
     problem of this size. A test holds the result to the estimator's.
@@ -146,4 +139,4 @@ def _fitted(omega: Array, y: Array, cost: float, epsilon: float, steps: int) -> 
         np.ascontiguousarray(omega), y, svm_type=_EPSILON_SVR, kernel="precomputed", C=cost / len(y), epsilon=epsilon,
         max_iter=steps, cache_size=_CACHE_MB,
     )  # fmt: skip
-    return _Found(support.astype(np.int64), alpha[0], float(bias[0]))
+    return support.astype(np.int64), alpha[0], float(bias[0])

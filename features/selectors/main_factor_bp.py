@@ -14,7 +14,7 @@ from features.design import Design, decimated_rows
 from features.nets import Nets
 from features.rises import zeroed_error_um
 from features.selectors.base import Diagnostic, Selector
-from features.selectors.statistics import check_n_tsps, chosen_of_varying, in_order, ranking, training_statistics
+from features.selectors.statistics import check_n_tsps, chosen_of_varying, ranking, training_statistics
 
 Columns = NDArray[np.int64]
 _COLLINEAR = 0.95  # |corr| from which two inputs count as one group for the diagnostics
@@ -86,11 +86,6 @@ class MainFactorBP(Selector):
         order = ranking(score, statistics.varying)
         varying = np.flatnonzero(statistics.varying)
         return chosen_of_varying(design, varying, n_tsps, lambda n: np.searchsorted(varying, order[:n]))
-
-    def select_above(self, design: Design, train: Sequence[int], threshold: float) -> tuple[str, ...]:
-        """The other published form: inputs of Sens_i ≥ threshold, in the design's order; perhaps none."""
-        found = self.sensitivity(design, train)
-        return in_order(design, found.columns[found.mean >= threshold])
 
     def diagnostics(self, design: Design, train: Sequence[int], n_tsp: int) -> tuple[Diagnostic, ...]:
         found = self.sensitivity(design, train)

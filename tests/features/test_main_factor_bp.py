@@ -37,14 +37,6 @@ def test_planted_main_factors_come_in_their_order() -> None:
     np.testing.assert_allclose(share, weight / weight.max(), atol=0.12)
 
 
-def test_the_threshold_form_keeps_what_is_large_enough() -> None:
-    selector = MainFactorBP(gate=0.0)
-    found = selector.sensitivity(planted(), TRAIN)
-    limit = float(np.sort(found.mean)[-2])
-    assert selector.select_above(planted(), TRAIN, limit) == ("t1", "t4")
-    assert selector.select_above(planted(), TRAIN, 1e9) == ()
-
-
 def test_only_inputs_behind_the_gate_enter_and_others_follow_by_correlation() -> None:
     design = stack(*year(), LENGTHS)
     x, y, _ = design.stacked(TRAIN)
