@@ -158,6 +158,15 @@ def test_what_does_not_help_takes_no_part():
     assert TransferFunction(poles=0).fit_design(still, range(6)).fitted["tau_s"].shape == (2, 0)
 
 
+def test_folds_of_drivers_are_the_fits_done_one_by_one_and_have_no_poles_of_one_or_two_batches():
+    design, family = make(two_inputs, batches=7, noise_um=0.5), TransferFunction(drivers=True)
+    folds = [[0, 1, 2, 3, 4], [2, 3, 4, 5, 6], [1, 3], [5], [0, 1, 2]]
+    for fold, model in zip(folds, family.fit_folds(design, folds), strict=True):
+        want = family.fit_design(design, fold).predict_design(design, [6])[0]
+        np.testing.assert_allclose(model.predict_design(design, [6])[0], want, atol=1e-6)
+        assert (model.fitted["tau_s"].shape[1] > 0) <= (len(fold) > 2)
+
+
 def test_holes_are_held_inside_and_stay_holes_outside():
     design = make(two_inputs, noise_um=0.1)
     x = design.x.copy()
