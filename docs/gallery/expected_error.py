@@ -30,7 +30,7 @@ below = (S_um < bound_um).mean()
 print(f"{below:.0%} of {len(later)} later runs below their bound; {outside.sum()} outside the trained region")
 assert below >= 0.85
 assert 1.0 < expected_um.mean() < 3.0 and 1.0 < S_um.mean() < 3.0  # µm
-assert 1 <= outside.sum() <= 6 and bound_um[outside].mean() > 1.05 * bound_um[~outside].mean()
+assert 1 <= outside.sum() <= 6 and bound_um[outside].min() > bound_um[~outside].max()
 
 dates = np.array([b.start for b in later])
 with picture(__file__, "Stated before the run, and measured in it", ylabel="S of the z error, µm", ylim=(0, 6)) as ax:

@@ -135,7 +135,7 @@ def test_the_page_and_the_json_say_the_same(recorded: Replay, tmp_path: Path) ->
     plain, s = json.loads(text), recorded.score("z")
     assert plain["schema"] == "thermodrift.replay/1" and len(plain["runs"]) == 3
     assert plain["scores"]["z"]["all"]["S_um"] == pytest.approx(s.S_um)
-    assert f"<dd>{s.S_um:.2f} µm</dd>" in page and f"<dd>{s.none_S_um:.2f} µm</dd>" in page
+    assert f"<dd><span>{s.S_um:.2f} µm</span>" in page and f"<dd><span>{s.none_S_um:.2f} µm</span>" in page
     assert "SIMULATED" in page and page.count("promoted</span>") == sum(g.promoted for g in recorded.retrainings)
     assert "http" not in page.replace("http://www.w3.org", "").replace("http-equiv", "")
     assert f"{s.n} runs: S {s.S_um:.2f} µm" in worth(recorded, "z")
