@@ -226,7 +226,8 @@ def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Se
             what = _noun(n.mechanism, Where(n.where.kind, n.where.name), place)
             least[n.mechanism] = f"{what} {with_unit(few(n.limit), n.unit)}"
     seen = list(least.values())[:_MAX_NAMED]
-    more = f" and {len(limits) - _MAX_NAMED} more in the table of limits" if len(limits) > _MAX_NAMED else ""
+    rest = len(limits) - len(seen)
+    more = f" and {rest} more in the table of limits" if rest else ""
     return (
         f"{text}. An effect above these limits would have been seen: {', '.join(seen)}{more}." if seen else f"{text}."
     )

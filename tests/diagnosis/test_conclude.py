@@ -1,4 +1,4 @@
-"""What is concluded: verdicts by what is left, when an effect is at work, which parameters are told."""
+"""What is concluded: verdicts by what is left, when an effect is at work, which parameters are reported."""
 
 from __future__ import annotations
 

@@ -204,6 +204,9 @@ def test_verdicts() -> None:
         "would have been seen: heat to the floor at the bed 1.8 W/K, waste heat of a control cabinet or of auxiliaries "
         "at the bed 12 W, sunlight on one face at the bed 20 W/m² and 3 more in the table of limits."
     )
+    assert verdict_statement("consistent", rms=after, limits=limits[:2], places=["the bed"] * 2).endswith(
+        "would have been seen: heat to the floor at the bed 1.8 W/K and 1 more in the table of limits."
+    )
     assert verdict_statement("consistent") == "Nothing is missing: the remaining error is the noise."
     more = "Too weak for a claim: heat to the floor: bed. A night switched off would show more."
     open_question = {"separates": "a night switched off", "possible": ["heat to the floor: bed"]}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import pickle
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -112,12 +112,16 @@ def test_all_folds_at_once_are_the_folds_one_by_one(key: str, form: str) -> None
 def test_a_trained_model_predicts_without_the_library_that_it_learned_with(
     key: str, library: str, tmp_path: Path
 ) -> None:
-    model, design = FAMILIES[key]().fit_design(by_hand(), [0, 1]), by_hand()
-    (tmp_path / "model").write_bytes(pickle.dumps((model.as_plain(), design)))
+    design = runs.design(False)
+    model = FAMILIES[key]().fit_design(design, [0, 1])
+    plain = json.dumps(model.as_plain(), default=lambda a: {"array": a.tolist(), "dtype": str(a.dtype)})
+    (tmp_path / "model").write_text(plain)
     code = (
-        "import pickle, sys; from models.base import family_from_plain; "
-        "plain, design = pickle.load(open(sys.argv[1], 'rb')); "
-        "error_um = family_from_plain(plain).predict_design(design, [2])[0]; "
+        "import json, sys; from pathlib import Path; import numpy as np; from models.base import family_from_plain; "
+        "from thermodrift.testing import runs; "
+        "array = lambda part: np.array(part['array'], part['dtype']) if 'array' in part else part; "
+        "plain = json.loads(Path(sys.argv[1]).read_text(), object_hook=array); "
+        "error_um = family_from_plain(plain).predict_design(runs.design(False), [2])[0]; "
         "print(float(error_um[-1]), sys.argv[2] in sys.modules)"
     )
     call = [sys.executable, "-c", code, str(tmp_path / "model"), library]
