@@ -2,13 +2,15 @@
 
     python -m benchmarks.kinds --kinds lathe board --cases 12 --out var/kinds
     python -m benchmarks.kinds --paired 808000 --table results/diagnosis_kinds.csv
+    python -m benchmarks.kinds --paired 840000 --noises 6 --claims results/claims.csv
 
 Draws cases of the proof for every kind (nothing missing, one effect, an effect of no list), diagnoses each, and prints
 by kind: effects named first (of those that are visible at all, and of all), cases of one effect that claim anything,
 false alarms, unlisted effects flagged, and seconds of CPU. Every case keeps the criteria of its rounds, and the rank
 and gain of the true candidate next to the winner's. Cases that are done are not done again; `--workers` side by side.
-`--paired` takes of every kind five cases with one effect of at least three times its noise and three with none, by
-seeds from the number given; `--table` stores a row for each. The proof (`thermodrift prove --plants …`) asks the same
+`--paired` takes of every kind five cases with one effect of at least `--noises` times its noise and three with none, by
+seeds from the number given; `--table` stores a row for each, `--claims` one for each round of all cases below `--out`,
+to which `POLICY.claim_offset` and `claim_weight` are fitted. The proof (`thermodrift prove --plants …`) asks the same
 under seal, with baselines.
 """
 
@@ -17,7 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -45,17 +47,19 @@ from thermodrift_exam.proof.suite.other_kinds import drawn_kind, executed_kind, 
 from twin.compile import compile_network
 from twin.schema import TwinPart, twin_part
 
-LEAST_SIGMAS = 3.0  # of the effect of a paired case, by the noise of the channel that it moves most
 PAIRED: dict[Kind, int] = {"one": 5, "nothing": 3}  # cases of each kind
 SHARES: dict[Kind, float] = {"nothing": 0.4, "one": 0.45, "unlisted": 0.15}
 SHOWN = 10
 
 
-def examined(kind: PlantKind, seed: int, out: str, proposed: int = 0, paired: Kind | None = None) -> dict[str, Any]:
+def examined(
+    kind: PlantKind, seed: int, out: str, proposed: int = 0, paired: Kind | None = None, noises: float = 3.0
+) -> dict[str, Any]:
     """One case, from its file where it is done already; with so many proposed runs after the first answer.
 
     Args:
         paired: what the case conceals; by default it is drawn.
+        noises: least size of the effect of a paired case, by the noise of the channel that it moves most.
     """
     path = Path(out) / f"{kind}_{seed}{f'_{paired}' if paired else ''}.json"
     if path.exists():
@@ -65,7 +69,7 @@ def examined(kind: PlantKind, seed: int, out: str, proposed: int = 0, paired: Ki
     while True:
         spec = kind_case("case_0001", what, kind, drawn, "development")
         case = drawn_kind(spec)
-        if paired is None or min((t["sigma"] for t in case.truth["terms"]), default=np.inf) >= LEAST_SIGMAS:
+        if paired is None or min((t["sigma"] for t in case.truth["terms"]), default=np.inf) >= noises:
             break
         drawn += 1
     answer = answer_of(spec, case)
@@ -144,7 +148,7 @@ def _round(r: Round, key: AnswerKey, bodies: Mapping[str, str]) -> dict[str, Any
         for k, s in enumerate(r.screen.scored) if right(s.candidate)
     ]  # fmt: skip
     return {
-        "accepted": r.accepted, "trust": r.trust, "features": dict(r.features), "raised": list(r.raised),
+        "accepted": r.accepted, "trust": r.trust, "fall": r.fall, "raised": list(r.raised),
         "right": r.best is not None and right(r.best.candidate), "threshold": r.threshold, "tried": tried,
         "screened": len(r.screen.scored), "true": screened[:SHOWN],
     }  # fmt: skip
@@ -194,10 +198,12 @@ def table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return out
 
 
-def pairs(kinds: Sequence[PlantKind], first: int, out: Path) -> list[tuple[PlantKind, int, str, int, Kind]]:
+def pairs(
+    kinds: Sequence[PlantKind], first: int, out: Path, noises: float
+) -> list[tuple[PlantKind, int, str, int, Kind, float]]:
     """The cases of `--paired`, in turn over the kinds."""
     return [
-        (kind, first - 1000 + 100 * k, str(out), 0, what)
+        (kind, first - 1000 + 100 * k, str(out), 0, what, noises)
         for k in range(max(PAIRED.values())) for what, n in PAIRED.items() if k < n for kind in kinds
     ]  # fmt: skip
 
@@ -219,11 +225,28 @@ def as_rows(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     return pd.DataFrame(found).sort_values(["kind", "seed", "concealed"])
 
 
+def claims(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+    """The claim of every round, accepted or not, with how much less it leaves, and whether it is right."""
+    found = [
+        {
+            "kind": r["kind"], "seed": r["seed"],
+            "concealed": "+".join(t["effect"] for t in r["terms"]) or "nothing", "round": k,
+            "claim": a["tried"][0]["name"], "gain_nats": round(a["tried"][0]["gain"], 1),
+            "threshold_nats": round(a["threshold"], 1), "fall": round(a["fall"], 4),
+            "right": "yes" if a["right"] else "no",
+        }
+        for r in rows for k, a in enumerate(r.get("rounds", ()), start=1) if a["tried"]
+    ]  # fmt: skip
+    return pd.DataFrame(found).sort_values(["kind", "seed", "concealed", "round"])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--kinds", nargs="+", choices=KIND_PLANTS, help="default: lathe and board; all with --paired")
     parser.add_argument("--paired", type=int, help="seed of the first pair")
     parser.add_argument("--table", type=Path, help="where a row for each case goes, .csv")
+    parser.add_argument("--noises", type=float, default=3.0, help="least size of the effect of a paired case")
+    parser.add_argument("--claims", type=Path, help="where the claim of each round below --out goes, .csv")
     parser.add_argument("--cases", type=int, default=12, help="of each kind")
     parser.add_argument("--first", type=int, default=0, help="seed of the first case")
     parser.add_argument("--workers", type=int, default=2)
@@ -233,7 +256,7 @@ def main() -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     tasks: list[tuple[Any, ...]] = []
     if given.paired is not None:
-        tasks += pairs(given.kinds or KIND_PLANTS, given.paired, given.out)
+        tasks += pairs(given.kinds or KIND_PLANTS, given.paired, given.out, given.noises)
     else:
         seeds, kinds = range(given.first, given.first + given.cases), given.kinds or ["lathe", "board"]
         tasks += [(kind, seed, str(given.out), given.proposed) for seed in seeds for kind in kinds]
@@ -243,9 +266,12 @@ def main() -> None:
             rows.append(row)
             effect = "+".join(f"{t['effect']} {t.get('sigma', 0):.1f}" for t in row["terms"]) or row["what"]
             first = next(iter(row.get("listed", ())), {"name": row.get("trouble", "no claim")})
-            print(f"{tasks[k][0]:<10} {effect:<28} {first['name'][:60]}  {row['cpu_s']:.0f} s", flush=True)
+            print(f"{tasks[k][0]:<10} {effect:<28} {first['name'][:60]}  {row.get('cpu_s', 0):.0f} s", flush=True)
     if given.table:
         write(given.table, as_rows(rows), f"python -m benchmarks.kinds --paired {given.paired} --table {given.table}")
+    if given.claims:
+        every = (json.loads(path.read_text()) for path in sorted(given.out.glob("*.json")))
+        write(given.claims, claims(every), f"python -m benchmarks.kinds --claims {given.claims}")
     print("\n".join([*table(rows), *(after_proposed(rows, given.proposed) if given.proposed else ())]))
 
 

@@ -321,7 +321,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "candidates": ("rank", "mechanism", "kind", "name", "words", "cluster", "gain", "improved", "batches", "absorbed",
                    "amplitude", "unit", "probability"),
     "map": ("kind", "place", "by", "label", "value", "unit", "z"),  # by: batch, regime, hour or since_start
-    "steps": ("step", "words", "gain", "threshold", "improved", "accepted"),
+    "steps": ("step", "words", "gain", "threshold", "removed", "improved", "accepted"),
     "refinements": ("what", "why", "before", "after"),
     "limits": ("mechanism", "kind", "name", "words", "limit", "unit", "absorbed", "absorbed_by"),
     "flux": ("kind", "place", "batch", "time_s", "value", "sd", "unit"),

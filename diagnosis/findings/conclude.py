@@ -169,6 +169,7 @@ def found_of(
         evidence={
             "gain_nats": best.gain,
             "threshold_nats": float(done.threshold),
+            "removed_share": done.removed,
             "left_out_nats": float(best.by_run.sum()),
             "batches_improved": best.improved,
             "batches": len(final.batches),

@@ -335,7 +335,7 @@ def _amplitude(amplitudes: Mapping[str, float], mechanism: str) -> tuple[float, 
 
 def steps_table(rounds: Sequence[Round]) -> pd.DataFrame:
     rows = [
-        (k + 1, r.best.candidate.label, r.best.gain, r.threshold, r.best.improved, r.accepted)
+        (k + 1, r.best.candidate.label, r.best.gain, r.threshold, r.removed, r.best.improved, r.accepted)
         for k, r in enumerate(rounds)
         if r.best is not None
     ]

@@ -26,6 +26,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 EVIDENCE: Mapping[str, str] = {
     "gain_nats": "rise of the log score of the batches left out, in nats",
     "threshold_nats": "gain that structure alone reaches when nothing is missing (99 % quantile)",
+    "removed_share": "share of the rms misfit that goes with the effect, geometric mean over channels, 0 to 1",
     "batches_improved": "left-out batches whose error falls",
     "batches": "left-out batches",
     "sign_test_p": "chance of so many improved batches if improving were a coin's toss",

@@ -138,6 +138,7 @@ def effect_phrase(found: Found) -> str:
 def falls(rms: Sequence[Rms], most: int = 2) -> str:
     """How far the errors of the runs left out fall, the greatest fall first, and which ones rise; nothing where none
     falls."""
+    rms = [r for r in rms if few(r.before) != few(r.after)]
     fallen = [r for r in rms if r.after < POLICY.fallen_max_share * r.before]
     fallen = sorted(fallen, key=lambda r: (r.after / r.before, r.channel))[:most]
     risen = [r for r in rms if r.before < POLICY.fallen_max_share * r.after and not r.after <= r.noise]

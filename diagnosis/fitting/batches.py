@@ -12,6 +12,7 @@ import pandas as pd
 from data.batch import Batch
 from data.errors import InputError
 from diagnosis.policy import POLICY
+from twin.calibration.problem import EVERY_S
 from twin.network import Network
 from twin.simulation.inputs import inputs_of
 
@@ -35,11 +36,17 @@ def enough_batches(batches: Sequence[Batch]) -> tuple[list[Batch], tuple[str, ..
     return out, remarks
 
 
-def coarse(batches: Sequence[Batch], spacing_s: float) -> list[Batch]:
-    """The batches with a row every `spacing_s`, or their own step where that is longer: what a machine does takes
+def spacing_s(batches: Sequence[Batch]) -> float:
+    """Seconds between the rows that are fitted."""
+    lengths = sorted(b.step_s * b.n_rows for b in batches) or [0.0]  # an empty recording is refused where simulated
+    return min(EVERY_S, lengths[len(lengths) // 2] / POLICY.min_rows_per_batch) or EVERY_S
+
+
+def coarse(batches: Sequence[Batch], every_s: float) -> list[Batch]:
+    """The batches with a row every `every_s`, or their own step where that is longer: what a machine does takes
     minutes, however often it is recorded. Sensors and errors are as read there, drivers their mean until the next row,
     so that heat is kept."""
-    return [_thinned(b, round(spacing_s / b.step_s)) if b.step_s else b for b in batches]
+    return [_thinned(b, round(every_s / b.step_s)) if b.step_s else b for b in batches]
 
 
 def _thinned(batch: Batch, stride: int) -> Batch:
@@ -56,15 +63,19 @@ def _thinned(batch: Batch, stride: int) -> Batch:
 def usable_batches(network: Network, batches: Sequence[Batch]) -> tuple[list[Batch], tuple[str, ...]]:
     """Those that the network can be driven with, and of the others why not: a hole in one run spoils no other.
 
+    Holes are longer on the `coarse` rows that are fitted.
+
     Raises:
         InputError: fewer than four are left, or fewer than half; the first reason.
     """
     kept: list[Batch] = []
     remarks: list[str] = []
     reasons: list[InputError] = []
+    every_s = spacing_s(batches)
     for batch in batches:
         try:
             inputs_of(network, [batch])
+            inputs_of(network, coarse([batch], every_s))
             kept.append(batch)
         except InputError as error:
             reasons.append(error)

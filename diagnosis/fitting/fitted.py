@@ -16,7 +16,7 @@ from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
 from diagnosis.contracts import Fitted, Point, own_step
-from diagnosis.fitting.batches import coarse
+from diagnosis.fitting.batches import coarse, spacing_s
 from diagnosis.fitting.carried import carried_nuisances, carried_start, carried_z
 from diagnosis.fitting.covariance import (
     Covariance,
@@ -46,7 +46,7 @@ from twin.calibration.least_squares import (
     x_of,
     z_bounds,
 )
-from twin.calibration.problem import EVERY_S, CalibrationProblem
+from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.schema import TwinPart
 
@@ -56,12 +56,6 @@ def check(machine: Machine, batches: Sequence[Batch]) -> None:
     if not batches:
         raise InputError(f"machine {machine.machine}: no batches to diagnose; give recordings")
     check_batches(machine, batches)
-
-
-def spacing_s(batches: Sequence[Batch]) -> float:
-    """Seconds between the rows that are fitted."""
-    lengths = sorted(b.step_s * b.n_rows for b in batches) or [0.0]  # an empty recording is refused where simulated
-    return min(EVERY_S, lengths[len(lengths) // 2] / POLICY.min_rows_per_batch) or EVERY_S
 
 
 def baseline(

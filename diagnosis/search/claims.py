@@ -1,6 +1,7 @@
-"""How probable a claim is: a logistic model of its gain over what structure alone gains on the same machine.
+"""How probable a claim is: a logistic model of how much less the twin leaves with it.
 
-The weights are a fit to development cases of eight kinds of machines.
+What wrong claims gain grows with what the network cannot represent, and reaches thousands of nats; they remove
+little of that. Offset and weight are a fit to development cases of six kinds of machines (`results/claims.csv`).
 """
 
 from __future__ import annotations
@@ -13,21 +14,18 @@ import numpy as np
 
 from data.arrays import Array
 from diagnosis.contracts import Fitted, Tried
+from diagnosis.fitting.fitted import plain
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen
-from twin.mechanisms import MECHANISMS
-
-FEATURES = ("excess", "network", "later")
 
 
 @dataclass(frozen=True)
 class Round:
     """One round: all that was tried, the claim first, and how probable it is.
 
-    `null` (T,) are the largest gains on refined twins with nothing missing, in nats; `features` of the claim by name;
-    `raised` channels by which it was refused, with rms before and after; `resolved` channels that show what is
-    impossible without it; `forms` the terms (`free_forms.Form`) of candidates of no listed mechanism; `later` after an
-    effect that was accepted.
+    `null` (T,) are the largest gains on refined twins with nothing missing, in nats; `fall` of what the twin leaves;
+    `raised` channels by which the claim was refused, with rms before and after; `resolved` channels that show what is
+    impossible without it; `forms` the terms (`free_forms.Form`) of candidates of no listed mechanism.
     """
 
     before: Fitted
@@ -36,11 +34,10 @@ class Round:
     null: Array
     trust: float
     accepted: bool
-    features: Mapping[str, float] = field(default_factory=dict)
+    fall: float = 0.0
     raised: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     resolved: frozenset[str] = frozenset()
     forms: Mapping[str, Any] = field(default_factory=dict)
-    later: bool = False
 
     @property
     def best(self) -> Tried | None:
@@ -51,6 +48,11 @@ class Round:
         """Nats that structure alone gains in one of a hundred refined twins (Gumbel 1958)."""
         return null_quantile(self.null)
 
+    @property
+    def removed(self) -> float:
+        """Share of the rms misfit that goes with the claim, geometric mean over channels; its `fall` in other words."""
+        return float(1.0 - np.exp(-self.fall))
+
 
 def null_quantile(null: Array) -> float:
     """The 99 % quantile of largest gains (T,) by a Gumbel distribution of their mean and spread."""
@@ -58,26 +60,19 @@ def null_quantile(null: Array) -> float:
     return float(np.mean(null) - scale * (np.euler_gamma + np.log(-np.log(POLICY.chance_quantile))))
 
 
-def features(t: Tried, done: Round) -> dict[str, float]:
-    """Of a claim of a round, by `FEATURES`.
+def fall(before: Fitted, after: Fitted) -> float:
+    """How much less the fit after leaves: ln(rms before / rms after), the mean over channels; 0.1 is a tenth less.
 
-    excess: logarithm of its gain over what structure gains in one of a hundred refined twins and what wrong claims gain
-    on any machine; network: 1 for what may only say that a network is drawn too coarse, or follows no law; later: 1
-    after an effect that was accepted, which is never modelled to the last nat.
+    Rms is not counted below noise. Of two predictions each channel counts the one that falls less: by the values of the
+    fit under structure, and by those of the `plain` fit. A wrong claim may improve one by harming the other.
     """
-    c = t.candidate
-    coarse = c.mechanism in MECHANISMS and MECHANISMS[c.mechanism].of_network
-    return {
-        "excess": float(np.log((1.0 + max(t.gain, 0.0)) / (max(done.threshold, 1.0) + POLICY.claim_scatter_nats))),
-        "network": float(c.kind.is_unlisted or coarse),
-        "later": float(done.later),
-    }
+    pairs = (before, after), (plain(before), plain(after))
+    return float(np.min([np.log(a.noise.factor / b.noise.factor) for a, b in pairs], axis=0).clip(min=0.0).mean())
 
 
-def trust(of: Mapping[str, float]) -> float:
-    """The probability that a claim of these features is true."""
-    odds = POLICY.claim_offset + sum(w * of[name] for name, w in zip(FEATURES, POLICY.claim_weights, strict=True))
-    return float(1.0 / (1.0 + np.exp(-odds)))
+def trust(fallen: float) -> float:
+    """The probability that a claim with this `fall` is true."""
+    return float(1.0 / (1.0 + np.exp(-POLICY.claim_offset - POLICY.claim_weight * fallen)))
 
 
 @dataclass(frozen=True)

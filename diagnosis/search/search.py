@@ -15,7 +15,7 @@ from diagnosis.fitting.fitted import left_out_rows, refitted, relearned, structu
 from diagnosis.localisation.balance import impossible
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, proposed, screen
-from diagnosis.search.claims import Round, features, null_quantile, trust
+from diagnosis.search.claims import Round, fall, null_quantile, trust
 from diagnosis.search.refits import Progress, odds_of, refits, shortlist
 from twin.schema import TwinPart
 
@@ -76,7 +76,7 @@ def one_round(
     tried = refits(now, seen, shortlist(now, seen, odds), odds, workers, tell)
     now, tried = _fair(now, tried)
     known = {n: f for n, (_, f) in forms.items()}
-    return decided(Round(now, seen, tuple(tried), null, 0.0, False, forms=known, later=before is not None))
+    return decided(Round(now, seen, tuple(tried), null, 0.0, False, forms=known))
 
 
 def decided(done: Round, vetoed: bool = True) -> Round:
@@ -124,10 +124,10 @@ def _judged(done: Round, t: Tried, may: Collection[str], impossible_now: frozens
     rest = [o for o in done.tried if o is not t]
     seen = screen(t.fitted, [s.candidate for s in done.screen.scored], done.screen)
     done = replace(done, null=seen.null_gains(may))
-    own = features(t, done)
+    fallen = fall(done.before, t.fitted)
     resolved = _resolves(t, impossible_now)
-    probable = POLICY.max_probability if resolved else trust(own)
-    enough = probable >= POLICY.claim_min_probability
+    probable = POLICY.max_probability if resolved else trust(fallen)
+    enough = probable >= POLICY.claim_min_probability and (bool(resolved) or t.gain > done.threshold)
     raised: Mapping[str, tuple[float, float]] = {}
     if enough and vetoed:
         fitted, raised = unharmed(done.before, t.fitted)
@@ -135,7 +135,7 @@ def _judged(done: Round, t: Tried, may: Collection[str], impossible_now: frozens
         if resolved:  # what makes it possible must also show it
             enough = bool(worsened(left_out_rows(fitted), left_out_rows(done.before)))
     return replace(
-        done, tried=(t, *rest), trust=probable, accepted=enough and not raised, features=own, raised=raised,
+        done, tried=(t, *rest), trust=probable, accepted=enough and not raised, fall=fallen, raised=raised,
         resolved=resolved,
     )  # fmt: skip
 

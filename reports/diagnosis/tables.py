@@ -54,6 +54,8 @@ GLOSSARY = (
     ("noise floor", "The rms that noise alone leaves to any simulation."),
     ("gain", "Rise of the log score (log likelihood) of the left-out runs, in nats; the threshold is what structure "
      "alone reaches when nothing is missing."),
+    ("misfit removed", "By how much less the twin leaves with an effect: rms over noise, geometric mean over channels. "
+     "It makes the probability of a claim."),
     ("absorbed", "Share of an effect's signature that recalibrating the other parameters imitates. Near 100 %, only "
      "its prior keeps it apart."),
     ("unexplained heat, displacement, reading", "What a smooth free input at that place would have to be to close the "
@@ -247,10 +249,12 @@ def steps(table: pd.DataFrame, simulated: bool) -> Table:
     for r in table.to_dict("records"):
         gain, threshold = _nats(r["gain"], sign=True), _nats(r["threshold"])
         verdict = "accepted" if r["accepted"] else "rejected"
-        rows.append(Row.of(f"{r['step']}", str(r["words"]), gain, threshold, f"{int(r['improved'])}", verdict))
+        removed, better = f"{100 * r['removed']:.0f} %", f"{int(r['improved'])}"
+        rows.append(Row.of(f"{r['step']}", str(r["words"]), gain, threshold, removed, better, verdict))
     columns = (
         Column("step"), Column("tried", kind="wide"), Column("gain", "nats", "number"),
-        Column("threshold", "nats", "number"), Column("runs better", kind="number"), Column("verdict"),
+        Column("threshold", "nats", "number"), Column("misfit removed", kind="number"),
+        Column("runs better", kind="number"), Column("verdict"),
     )  # fmt: skip
     return Table("Steps of the search", columns, tuple(rows), simulated)
 

@@ -11,9 +11,12 @@ import pytest
 from data.batch import Batch, Finding
 from data.errors import InputError
 from diagnosis.fitting.batches import enough_batches, usable_batches
+from diagnosis.fitting.fitted import baseline
 from diagnosis.policy import POLICY
 from tests.diagnosis.small_cases import runs, two_bodies
 from twin.compile import compile_network
+from twin.schema import twin_part
+from twin.simulation.inputs import inputs_of
 
 
 def some(count: int) -> list[Batch]:
@@ -96,6 +99,23 @@ def test_a_hole_that_cannot_be_bridged_costs_its_run_alone() -> None:
     assert len(words) == 1
     assert words[0].startswith(f"left out: batch {every[0].batch_id}: channel 'room' has no value from ")
     assert usable_batches(network, every) == (every, ())
+
+
+def test_a_hole_that_is_too_long_on_the_rows_that_are_fitted_costs_its_run_alone() -> None:
+    def every_minute(batch: Batch) -> Batch:
+        time_s = np.arange(0.0, batch.time_s[-1] + 1.0, 60.0)
+        table = pd.DataFrame({c: np.interp(time_s, batch.time_s, batch.table[c]) for c in batch.table.columns})
+        return replace(batch, table=table)
+
+    known = two_bodies()
+    every = [every_minute(b) for b in runs(known, count=6)]
+    table = every[0].table.copy()
+    table.loc[(table["time_s"] >= 1440) & (table["time_s"] < 1440 + 900), "room"] = np.nan  # bridged as it is recorded
+    given = [replace(every[0], table=table), *every[1:]]
+    assert len(inputs_of(compile_network(known), given).batch_ids) == 6
+    kept, (words,) = usable_batches(compile_network(known), given)
+    assert [b.batch_id for b in kept] == [b.batch_id for b in every[1:]] and words.startswith("left out: batch b00: ")
+    baseline(known, twin_part(known), kept)
 
 
 def test_where_few_are_left_the_first_hole_is_told() -> None:

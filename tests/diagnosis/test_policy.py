@@ -6,9 +6,12 @@ import ast
 from dataclasses import FrozenInstanceError, fields
 from pathlib import Path
 
+import pandas as pd
 import pytest
+from sklearn.linear_model import LogisticRegression
 
 from diagnosis.policy import POLICY, STAGES, Policy, markdown
+from diagnosis.search.claims import trust
 
 ROOT = Path(__file__).parents[2]
 # Numerics and presentation: grids, guards against division by zero, digits, widths, axes of tables.
@@ -81,3 +84,10 @@ def test_a_policy_is_not_changed_in_place() -> None:
 def test_the_documentation_shows_the_policy() -> None:
     """After a change: ``python -m diagnosis.policy > docs/policy.md``."""
     assert (ROOT / "docs" / "policy.md").read_text(encoding="utf-8") == "\n".join(markdown()) + "\n"
+
+
+def test_the_probability_of_a_claim_is_the_fit_to_the_stored_claims() -> None:
+    stored = pd.read_csv(ROOT / "results" / "claims.csv")
+    fit = LogisticRegression(C=1e6).fit(stored[["fall"]].to_numpy(), stored["right"] == "yes")
+    assert (round(fit.intercept_[0], 1), round(fit.coef_[0, 0], 1)) == (POLICY.claim_offset, POLICY.claim_weight)
+    assert trust(0.0) < 0.2 and trust(1.0) > 0.99

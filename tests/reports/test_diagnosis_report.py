@@ -288,6 +288,7 @@ def test_limits_and_steps_have_their_units() -> None:
     )  # fmt: skip
     assert limits.rows[3].cells[1:] == ("0.04 K/h", "20 %", "–")
     assert [r.cells[-1] for r in diagnosis_tables.steps(t["steps"], True).rows] == ["accepted", "rejected"]
+    assert diagnosis_tables.steps(t["steps"], True).rows[0].cells[2:5] == ("+412", "31", "62 %")
 
 
 def test_the_runs_of_every_channel_are_in_a_table() -> None:
