@@ -7,13 +7,13 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from data.arrays import Array
 from features.design import Design
 from models.base import Family, Plain
 from models.program import Builder
 from models.solvers.batches import bridged, padded, steps_s, too_few_rows, unpadded
+from models.solvers.lags import behind
 
 EXPONENTS = (1.0, 0.5, 0.75, 1.25, 1.5, 1.75, 2.0)  # 1 first: it is kept where there is one speed
 _TAU_GRID_S = np.geomspace(120.0, 43200.0, 25)
@@ -90,7 +90,7 @@ class ThermalExponential(Family):
         steps = steps_s(design)
         total = np.zeros_like(load)
         for tau_s, amplitude in zip(taus_s, amplitudes, strict=True):
-            total += amplitude * lag_response(load, tau_s, steps)
+            total += amplitude * behind(load, tau_s, steps)
         rows = unpadded(design, total)
         return [rows[design.rows(k)] for k in batches]
 
@@ -104,18 +104,6 @@ class ThermalExponential(Family):
 
     def n_parameters(self) -> int:
         return 2 * int(np.size(self.fitted["tau_s"])) + (1 if self.fitted["speed_channel"] else 0)
-
-
-def lag_response(load: Array, tau_s: float, step_s: Array) -> Array:
-    """τ dv/dt + v = load from v = 0 at the first row, exact for a load held over each step, (K, n); steps (K,)."""
-    driven = load.copy()
-    driven[:, :1] = 0.0
-    out = np.zeros_like(load)
-    for step in np.unique(step_s[np.isfinite(step_s)]):
-        keep = float(np.exp(-step / tau_s))
-        which = step_s == step
-        out[which] = lfilter([1.0 - keep], [1.0, -keep], driven[which], axis=1)
-    return out
 
 
 class _Sums:
@@ -132,7 +120,7 @@ class _Sums:
         gram = np.empty((design.n_batches, len(loads), len(_TAU_GRID_S), len(_TAU_GRID_S)))
         with_y = np.empty(gram.shape[:3])
         for m, load in enumerate(loads):
-            lags = np.stack([lag_response(load, tau, steps) for tau in _TAU_GRID_S], axis=1) * weight[:, None]
+            lags = np.stack([behind(load, tau, steps) for tau in _TAU_GRID_S], axis=1) * weight[:, None]
             gram[:, m] = lags @ lags.transpose(0, 2, 1)
             with_y[:, m] = np.einsum("ktn,kn->kt", lags, y)
         ends = np.diff(design.offsets) - 1
@@ -173,7 +161,7 @@ def _refined(
     load = load[batches]
 
     def solve(log_tau: Array) -> tuple[float, Array, list[Array], Array]:
-        lags = [lag_response(load, float(np.exp(v)), steps) for v in log_tau]
+        lags = [behind(load, float(np.exp(v)), steps) for v in log_tau]
         basis = np.stack([lag[use] for lag in lags])
         amplitude: Array = np.linalg.lstsq(basis @ basis.T, basis @ y, rcond=1e-12)[0].astype(float)
         residual = y - amplitude @ basis
@@ -212,14 +200,10 @@ def _allowed(log_tau: Array) -> Array:
 
 def _lag_slope(load: Array, tau_s: float, step_s: Array, lag: Array) -> Array:
     """d lag / d log τ, (K, n), from the recursion's own derivative."""
-    out = np.zeros_like(load)
-    for step in np.unique(step_s[np.isfinite(step_s)]):
-        keep = float(np.exp(-step / tau_s))
-        which = step_s == step
-        driven = np.zeros_like(load[which])
-        driven[:, 1:] = keep * step / tau_s * (lag[which, :-1] - load[which, 1:])
-        out[which] = lfilter([1.0], [1.0, -keep], driven, axis=1)
-    return out
+    ratio = step_s / tau_s
+    driven = np.zeros_like(load)
+    driven[:, 1:] = (ratio / np.expm1(ratio))[:, None] * (lag[:, :-1] - load[:, 1:])
+    return behind(driven, tau_s, step_s)
 
 
 def _load(speed_rpm: Array, exponent: float) -> Array:

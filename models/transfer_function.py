@@ -14,6 +14,7 @@ from models.base import Family
 from models.linear import left_out_spread, mean_square, stated_sd_um
 from models.program import Builder
 from models.solvers.batches import fold_masks
+from models.solvers.lags import lag_responses
 from models.solvers.poles import (
     TAUS_S,
     Candidate,
@@ -22,13 +23,11 @@ from models.solvers.poles import (
     Source,
     combination,
     drivers_of,
-    gains,
     gaps_of,
     only,
     refined,
-    responses,
 )
-from models.solvers.pooled_sums import Blocks
+from models.solvers.pooled_sums import Blocks, ridge_path
 
 _FEWEST_ROWS = 8
 _MOST_INPUTS = 60
@@ -97,11 +96,11 @@ class TransferFunction(Family):
         """NaN at a row where an input is missing, and throughout a batch that lacks a driver the model needs."""
         f, some = self.fitted, only(design, batches)
         parts = zip(f["kinds"], f["names"], f["exponents"], strict=True)
-        signals = np.column_stack([Source(kind, name, float(m)).signal(some) for kind, name, m in parts])
-        error_um = f["intercept_um"] + signals @ f["direct_um"]
-        tau_s, gain_um = np.asarray(f["tau_s"]), np.asarray(f["gain_um"])
-        for pole in range(tau_s.shape[1]):
-            error_um = error_um + responses(some, signals, tau_s[:, pole]) @ gain_um[:, pole]
+        signals = [Source(kind, name, float(m)).signal(some)[:, None] for kind, name, m in parts]
+        error_um = np.full(len(some.time_s), f["intercept_um"])
+        for signal, direct, gains, taus_s in zip(signals, f["direct_um"], f["gain_um"], f["tau_s"], strict=True):
+            own = lag_responses(some, signal, [(0.0, 0.0), *((0.0, tau_s) for tau_s in taus_s)])[:, :, 0]
+            error_um += own @ np.array([direct, *gains])
         error_um = np.where(np.isfinite(some.x).all(axis=1), error_um, np.nan)
         return [error_um[some.rows(k)] for k in range(some.n_batches)]
 
@@ -175,7 +174,12 @@ class TransferFunction(Family):
         tried, chosen = np.unique(penalty, return_inverse=True)
         square = mean_square(self.started(dictionary.design).x, dictionary.design)
         spread = left_out_spread(
-            dictionary.table.subset(tuple(names)), square, masks, False, lambda pool: gains(pool, tried), chosen
+            dictionary.table.subset(tuple(names)),
+            square,
+            masks,
+            False,
+            lambda pool: ridge_path(pool.xx, pool.xy, tried),
+            chosen,
         )
         return [
             {"variance_um2": float(a), "variance_growth_um2": float(b)} if np.isfinite(a) else {}

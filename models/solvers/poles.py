@@ -19,9 +19,9 @@ from features.design import Design, Moments
 from features.rises import hold_last
 from models.linear import EPS
 from models.program import Builder
-from models.solvers.batches import bridged, padded, steps_s, unpadded
-from models.solvers.pooled_sums import Blocks, Pool, left_out_mean_S_um
-from models.thermal_exponential import lag_response
+from models.solvers.batches import bridged
+from models.solvers.lags import lag_responses, with_columns
+from models.solvers.pooled_sums import Blocks, Pool, left_out_mean_S_um, mean_diagonal, ridge_path
 
 TAUS_S = np.geomspace(120.0, 43200.0, 15)
 EXPONENTS = (1.0, 1.5, 2.0)
@@ -99,22 +99,6 @@ def gaps_of(design: Design) -> list[Source]:
     return [s for s in found if np.isfinite(s.signal(design)).all()]
 
 
-def responses(design: Design, signals: Array, tau_s: Array) -> Array:
-    """τ dv/dt + v = u from v = 0 at each batch's first row, (n, S): one time constant per signal, (S,).
-
-    Exact for a signal held over the step before its sample.
-    """
-    steps = steps_s(design)
-    laid = padded(design, signals)
-    out = np.empty_like(laid)
-    for tau in np.unique(tau_s):
-        some = np.flatnonzero(tau_s == tau)
-        flat = laid[:, :, some].transpose(2, 0, 1).reshape(-1, laid.shape[1])
-        lagged = lag_response(flat, float(tau), np.tile(steps, len(some)))
-        out[:, :, some] = lagged.reshape(len(some), *laid.shape[:2]).transpose(1, 2, 0)
-    return unpadded(design, out)
-
-
 @dataclass(frozen=True)
 class Dictionary:
     """The columns of S sources on a design: first the signals themselves, then their responses to every τ.
@@ -129,13 +113,9 @@ class Dictionary:
     @cached_property
     def table(self) -> Design:
         """All columns as a design on the same usable rows."""
-        own = self.design
-        signals = np.column_stack([s.signal(own) for s in self.sources])
-        columns = [signals, *(responses(own, signals, np.full(len(self.sources), tau)) for tau in TAUS_S)]
-        x = np.nan_to_num(np.column_stack(columns))
-        y_um = np.where(own.usable, own.y_um, np.nan)
-        table = replace(own, inputs=tuple(map(str, range(x.shape[1]))), x=x, y_um=y_um, input_units=(), _columns=None,
-                        _parent=None)  # fmt: skip
+        signals = np.column_stack([s.signal(self.design) for s in self.sources])
+        columns = lag_responses(self.design, signals, [(0.0, 0.0), *((0.0, tau_s) for tau_s in TAUS_S)])
+        table = with_columns(self.design, np.nan_to_num(columns.reshape(len(signals), -1)))
         return table.started if self.about_start else table
 
     def places(self, which: Sequence[int], poles: Sequence[int]) -> list[int]:
@@ -292,21 +272,8 @@ class Search:
     def _left_out(self, candidate: Candidate, masks: Mask, penalties: Array) -> Array:
         columns = self.dictionary.places(candidate.sources(self.dictionary), candidate.poles)
         return left_out_mean_S_um(
-            Blocks.of(self.moments.subset(columns)), masks, False, lambda pool: gains(pool, penalties)
+            Blocks.of(self.moments.subset(columns)), masks, False, lambda pool: ridge_path(pool.xx, pool.xy, penalties)
         )
-
-
-def gains(pool: Pool, penalties: Array) -> Array:
-    """Ridge (S, p, G): (XX + k trace(XX)/p) g = Xy for every penalty k."""
-    alpha = _mean_diagonal(pool.xx)
-    out = np.empty((*pool.xy.shape, len(penalties)))
-    matrix = pool.xx.copy()
-    diagonal = np.einsum("sjj->sj", matrix)
-    own = diagonal.copy()
-    for g, k in enumerate(penalties):
-        diagonal[:] = own + k * alpha[:, None]
-        out[:, :, g] = np.linalg.solve(matrix, pool.xy[:, :, None])[:, :, 0]
-    return out
 
 
 def _second_pole(c: Candidate) -> list[Candidate]:
@@ -332,7 +299,7 @@ class _Solved:
         weight, slope = combination(log_tau, direct)
         across = weight.transpose(0, 2, 1)
         matrix, right = across @ pool.xx @ weight, (across @ pool.xy[:, :, None])[:, :, 0]
-        alpha = penalty * _mean_diagonal(matrix)
+        alpha = penalty * mean_diagonal(matrix)
         ridge = alpha[:, None, None] * np.eye(matrix.shape[1])
         gain = np.asarray(np.linalg.solve(matrix + ridge, right[:, :, None])[:, :, 0], float)
         square = np.einsum("fj,fj->f", gain, (matrix @ gain[:, :, None])[:, :, 0])
@@ -373,13 +340,13 @@ def refined(
 ) -> tuple[Array, Array]:
     """Each source's poles by itself: penalised Gauss–Newton on log τ, shortened until it helps (variable projection).
 
-    Minimises `|y − Σ g v|² + α |g|² + σ² m |log τ − log τ_shared|² / looseness²`: α is the ridge of `gains`, σ² the
-    residual variance, and the m rows of a batch count as one observation, because they are not independent.
+    Minimises `|y − Σ g v|² + α |g|² + σ² m |log τ − log τ_shared|² / looseness²`: α is the ridge of `ridge_path`, σ²
+    the residual variance, and the m rows of a batch count as one observation, because they are not independent.
 
     Args:
         pool: sums over the dictionary's columns of the S sources in the order of `Dictionary.block`, F sets.
         yy: the target's centred sum of squares, (F,). shared: log τ of the poles that all sources start from, (F, L).
-        penalty: k of `gains`, (F,). rows: mean rows per batch, (F,).
+        penalty: k of `ridge_path`, (F,). rows: mean rows per batch, (F,).
 
     Returns:
         log τ (F, S, L) and gains (F, D + L S) of the columns of `combination`.
@@ -393,9 +360,3 @@ def refined(
         better = trial.cost(shared, hold) < now.cost(shared, hold)
         now, share = now.where(better, trial), np.where(better, np.minimum(2.0 * share, 1.0), 0.3 * share)
     return now.log_tau, now.gain
-
-
-def _mean_diagonal(matrix: Array) -> Array:
-    """trace/p (S,) of (S, p, p); 1 where nothing moves."""
-    mean = np.einsum("sjj->s", matrix) / matrix.shape[1]
-    return np.where(mean > 0, mean, 1.0)

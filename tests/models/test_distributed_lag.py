@@ -9,18 +9,18 @@ import pytest
 from data.batch import Batch, Channel
 from features.design import Design
 from features.rises import first_order_lag
-from models.distributed_lag import KOYCK_TAUS_S, DistributedLag
-from models.linear import Blocks, Task
-from models.solvers.lags import (
+from models.distributed_lag import (
     CRITERIA,
+    KOYCK_TAUS_S,
     RIDGES,
-    LagRegression,
+    DistributedLag,
+    criterion,
     effective_rows,
-    free_shapes,
     koyck_shapes,
-    lag_responses,
-    polynomial_shapes,
+    lag_shapes,
 )
+from models.linear import Task
+from models.solvers.lags import lag_responses
 
 SIZES = (60, 45, 52, 40, 57)
 
@@ -32,7 +32,7 @@ def rises(n, p, rng, step_s=300.0):
     return load + rng.uniform(0.5, 2, p) * np.sin(hours * rng.uniform(2, 5, p))
 
 
-def make_design(law=None, p=2, noise_um=0.0, seed=0, step_s=300.0, drivers=()) -> Design:
+def make_design(law=None, p=2, noise_um=0.0, seed=0, step_s=300.0) -> Design:
     """`law(x)` gives the error (n,) of one batch from its rises (n, p)."""
     rng = np.random.default_rng(seed)
     parts = [rises(n, p, rng, step_s) for n in SIZES]
@@ -40,7 +40,7 @@ def make_design(law=None, p=2, noise_um=0.0, seed=0, step_s=300.0, drivers=()) -
     names = tuple(f"t{j}" for j in range(p))
     return Design(names, "z", tuple(f"K{k + 1}" for k in range(len(SIZES))), np.vstack(parts),
                   y + rng.normal(0, noise_um, len(y)), np.concatenate([np.arange(n) * step_s for n in SIZES]),
-                  np.concatenate([[0], np.cumsum(SIZES)]).astype(np.int64), step_s, driver_names=drivers)  # fmt: skip
+                  np.concatenate([[0], np.cumsum(SIZES)]).astype(np.int64), step_s)  # fmt: skip
 
 
 def shifted(x, rows, before=0.0):
@@ -66,7 +66,7 @@ def ridge(x, y, k):
 
 def test_responses_are_shifts_and_first_order_lags_of_each_batch_alone():
     design = make_design(seed=1)
-    got = lag_responses(design, [(0, 0), (900, 0), (450, 0), (0, 1800), (600, 1800)])
+    got = lag_responses(design, design.x, [(0, 0), (900, 0), (450, 0), (0, 1800), (600, 1800)], at_rest=False)
     for k in range(design.n_batches):
         x, own = design.x[design.rows(k)], got[design.rows(k)]
         np.testing.assert_array_equal(own[:, 0], x)
@@ -77,10 +77,10 @@ def test_responses_are_shifts_and_first_order_lags_of_each_batch_alone():
         np.testing.assert_allclose(own[:, 4], shifted(lag, 2), atol=1e-12)
 
 
-def test_before_the_start_a_temperature_has_its_first_value_and_a_driver_rests():
-    design = make_design(seed=2, drivers=("t1",))
+def test_before_the_start_a_temperature_has_its_first_value_and_another_input_rests():
+    design = make_design(seed=2)
     design.x[:] += 7.0
-    got = lag_responses(design, [(600, 0), (0, 3600)])[design.rows(1)]
+    got = lag_responses(design, design.x, [(600, 0), (0, 3600)], np.array([False, True]))[design.rows(1)]
     x = design.x[design.rows(1)]
     np.testing.assert_array_equal(got[:2, 0], [[x[0, 0], 0.0]] * 2)
     np.testing.assert_array_equal(got[0, 1], [x[0, 0], 0.0])
@@ -181,8 +181,7 @@ def test_almon_weights_lie_on_a_polynomial_and_equal_regression_on_its_terms():
 
 def task_of(design, folds):
     masks = np.array([[k in fold for k in range(design.n_batches)] for fold in folds])
-    blocks = Blocks.of(design.moments)
-    return Task(design, masks, blocks, blocks.pool(masks, False), False)
+    return Task.of(design, masks, False)
 
 
 @pytest.mark.parametrize("order_by", ["aic", "bic"])
@@ -191,7 +190,7 @@ def test_the_criteria_count_parameters_and_effective_rows(order_by):
     columns = Design(tuple("abcdef"), "z", design.batch_ids, table_of(design, [0, 3, 6]), design.y_um, design.time_s,
                      design.offsets, 300.0)  # fmt: skip
     task = task_of(columns, [[0, 1, 2, 3, 4], [1, 2, 3]])
-    got = LagRegression(free_shapes(2), order_by)._criterion(task)
+    got = criterion(task, lag_shapes(2, 2), order_by)
     for f, fold in enumerate([[0, 1, 2, 3, 4], [1, 2, 3]]):
         x, y, batch = columns.stacked(fold)
         beta, constant = ridge(x, y, RIDGES[-1])
@@ -253,9 +252,9 @@ def test_lags_are_never_closer_than_a_step():
 
 
 def test_shapes():
-    assert [len(s.responses) for s in free_shapes(5)] == [1, 2, 3, 4, 5, 6]
-    assert [s.mix.shape for s in polynomial_shapes(4, 2)] == [(1, 1), (2, 2), (3, 3), (4, 3), (5, 3)]
-    assert [s.responses for s in koyck_shapes(2)] == [(0,), (0, 1), (0, 2)]
+    used = [[np.flatnonzero(s.any(axis=1)).tolist() for s in shapes] for shapes in (lag_shapes(5, 5), koyck_shapes(2))]
+    assert used == [[list(range(q + 1)) for q in range(6)], [[0], [0, 1], [0, 2]]]
+    assert [s.shape for s in lag_shapes(4, 2)] == [(5, 1), (5, 2), (5, 3), (5, 3), (5, 3)]
 
 
 def drifting_runs(n_runs=9, n=48, step_s=300.0) -> list[Batch]:

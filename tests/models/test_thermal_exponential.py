@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from features.design import Design
-from models.thermal_exponential import ThermalExponential, lag_response
+from models.solvers.lags import behind
+from models.thermal_exponential import ThermalExponential
 
 
 def make_design(speeds, y, step_s=300.0, unit="rpm") -> Design:
@@ -49,16 +50,16 @@ def test_recovers_two_lags_and_the_exponent_over_three_speeds():
     np.testing.assert_allclose(model.fitted["amplitude_um"], [8.0, -3.0], rtol=3e-3)
 
 
-def test_lag_response_is_the_closed_form_for_steps():
+def test_a_response_is_the_closed_form_for_steps():
     load = np.concatenate([np.ones(50), np.zeros(50)])[None]
-    got = lag_response(load, 2000.0, np.array([300.0]))[0]
+    got = behind(load, 2000.0, np.array([300.0]))[0]
     np.testing.assert_allclose(got[:50], 1 - np.exp(-T[:50] / 2000), atol=1e-12)
     np.testing.assert_allclose(got[50:], got[49] * np.exp(-(T[50:] - T[49]) / 2000), atol=1e-12)
 
 
 def test_a_stop_cools_down():
     speed = np.where(T < 15000, 3000.0, 0.0)
-    error = 4.0 * 3.0 * lag_response((speed > 0).astype(float)[None], 3000.0, np.array([300.0]))[0]
+    error = 4.0 * 3.0 * behind((speed > 0).astype(float)[None], 3000.0, np.array([300.0]))[0]
     running = np.full(100, 3000.0)
     design = make_design([speed, running], [error, np.full(100, np.nan)])
     model = ThermalExponential().fit_design(design, [0])

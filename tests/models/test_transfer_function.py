@@ -12,7 +12,8 @@ from data.errors import InputError
 from features.design import Design
 from models.metrics import residual_std_um
 from models.ridge import Ridge
-from models.solvers.poles import TAUS_S, Dictionary, Source, combination, only, responses
+from models.solvers.lags import lag_responses
+from models.solvers.poles import TAUS_S, Dictionary, Source, combination, only
 from models.transfer_function import TransferFunction
 
 STEP_S = 120.0
@@ -74,9 +75,15 @@ def left_out_S_um(family, design):
     return float(np.mean([residual_std_um(e) for e in errors]))
 
 
+def responses(design, taus_s):
+    """Each input behind its own lag, (n, p)."""
+    return np.column_stack([lag_responses(design, x[:, None], [(0.0, t)]).ravel()
+                            for x, t in zip(design.x.T, taus_s, strict=True)])  # fmt: skip
+
+
 def test_responses_are_those_of_an_independent_simulation():
     design = make(two_inputs, batches=2)
-    got = responses(design, design.x, np.array([600.0, 20000.0]))
+    got = responses(design, (600.0, 20000.0))
     for k in range(2):
         rows = design.rows(k)
         for j, tau_s in enumerate((600.0, 20000.0)):
@@ -90,10 +97,10 @@ def test_a_pole_between_the_grids_is_a_combination_of_its_neighbours():
     weight, slope = combination(np.log(tau_s)[None], np.array([True, True]))
     columns = dictionary.table.x @ weight[0]
     np.testing.assert_allclose(columns[:, :2], design.x, atol=1e-12)
-    exact = [responses(design, design.x, tau_s[:, pole]) for pole in range(2)]
+    exact = [responses(design, tau_s[:, pole]) for pole in range(2)]
     size = np.abs(design.x).max()
     np.testing.assert_allclose(columns[:, 2:], np.hstack(exact), atol=2e-4 * size)
-    above, below = (responses(design, design.x, tau_s[:, 1] * np.exp(h)) for h in (1e-4, -1e-4))
+    above, below = (responses(design, tau_s[:, 1] * np.exp(h)) for h in (1e-4, -1e-4))
     np.testing.assert_allclose(dictionary.table.x @ slope[0][:, 2:], (above - below) / 2e-4, atol=2e-3 * size)
     assert dictionary.places([0, 1], [3]) == [0, 1, 8, 9] and len(dictionary.block([1])) == len(TAUS_S) + 1
 
