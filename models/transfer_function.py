@@ -13,7 +13,7 @@ from features.design import Design
 from models.base import Family
 from models.linear import left_out_spread, mean_square, stated_sd_um
 from models.program import Builder
-from models.solvers.batches import fold_masks
+from models.solvers.batches import fold_masks, only
 from models.solvers.lags import lag_responses
 from models.solvers.poles import (
     TAUS_S,
@@ -24,7 +24,6 @@ from models.solvers.poles import (
     combination,
     drivers_of,
     gaps_of,
-    only,
     refined,
 )
 from models.solvers.pooled_sums import Blocks, ridge_path

@@ -167,17 +167,6 @@ def _interpolated(log_tau: Array) -> tuple[Array, Array]:
     return weight, slope
 
 
-def only(design: Design, batches: Sequence[int]) -> Design:
-    """Some batches of a design, in the order given."""
-    rows = np.concatenate([np.arange(design.offsets[k], design.offsets[k + 1]) for k in batches])
-    offsets = np.concatenate([[0], np.cumsum(np.diff(design.offsets)[list(batches)])]).astype(np.int64)
-    return replace(design, batch_ids=tuple(design.batch_ids[k] for k in batches), x=design.x[rows],
-                   y_um=design.y_um[rows], time_s=design.time_s[rows], offsets=offsets,
-                   drivers=design.drivers[rows] if design.driver_names else design.drivers,
-                   batches=tuple(design.batches[k] for k in batches) if design.batches else (), _columns=None,
-                   _parent=None)  # fmt: skip
-
-
 def ambient_of(design: Design) -> str:
     """The first ambient channel; "" where the design has no batches or they have none."""
     names = design.batches[0].names("ambient") if design.batches else ()

@@ -9,9 +9,8 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import ElasticNet as SkElasticNet
 
 from features.design import Design
-from models.elastic_net import ElasticNet
+from models.elastic_net import ElasticNet, sparse_coefficients
 from models.linear import Blocks
-from models.solvers.penalised import sparse_coefficients
 
 K, N, P = 6, 40, 6
 FOLDS = [[j for j in range(K) if j != k] for k in range(K)] + [[2], [0, 3], [1, 2, 5]]

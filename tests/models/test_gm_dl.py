@@ -10,9 +10,8 @@ from data.batch import Batch, Channel
 from features.design import Design
 from models.distributed_lag import DistributedLag
 from models.gm1n import GM1N
-from models.gm_dl import GMDL
+from models.gm_dl import GMDL, band_weights, bands_of, start_temperatures_degC
 from models.solvers.grey_models import grey_layers, layer_design
-from models.solvers.start_bands import band_weights, bands_of, start_temperatures_degC
 
 STARTS_DEGC = (4.0, 31.0, 12.0, 5.0, 19.0, 30.0, 20.0, 6.0, 18.0, 29.0, 21.0, 13.0)
 INPUTS = ("head", "bed")

@@ -8,9 +8,8 @@ from scipy.optimize import minimize
 from sklearn.linear_model import HuberRegressor
 
 from features.design import Design
-from models.huber import Huber
+from models.huber import Huber, settle
 from models.mlr import MLR
-from models.solvers.penalised import settle
 
 K, N, P = 6, 50, 4
 COEF = np.array([2.0, -1.5, 0.8, 3.0])

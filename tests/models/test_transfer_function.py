@@ -12,8 +12,9 @@ from data.errors import InputError
 from features.design import Design
 from models.metrics import residual_std_um
 from models.ridge import Ridge
+from models.solvers.batches import only
 from models.solvers.lags import lag_responses
-from models.solvers.poles import TAUS_S, Dictionary, Source, combination, only
+from models.solvers.poles import TAUS_S, Dictionary, Source, combination
 from models.transfer_function import TransferFunction
 
 STEP_S = 120.0

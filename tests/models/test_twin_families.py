@@ -141,16 +141,16 @@ def test_the_residual_learns_from_batches_that_its_twin_did_not_see():
     given = design(SCATTERED)
     fold = tuple(range(6))
     twin = Twin().fit_design(given, fold)
-    honest = TwinResidual()._left_out(given, fold)
-    assert not np.isfinite(honest.y_um[given.rows(6)]).any()
+    _, left_um = TwinResidual()._left_out(given, fold)
+    assert not np.isfinite(left_um[given.rows(6)]).any()
     seen = np.concatenate(
         [(given.y_um[given.rows(k)] - p) for k, p in zip(fold, twin.predict_design(given, fold), strict=True)]
     )
-    left = np.concatenate([honest.y_um[given.rows(k)] for k in fold])
+    left = np.concatenate([left_um[given.rows(k)] for k in fold])
     assert np.nanstd(left) > 1.02 * np.nanstd(seen)
     one = Twin().fit_design(given, [0, 1, 2, 4, 5])
     exact = given.y_um[given.rows(3)] - one.predict_design(given, [3])[0]
-    np.testing.assert_allclose(honest.y_um[given.rows(3)], exact, atol=0.25 * np.nanstd(exact) + 0.1)
+    np.testing.assert_allclose(left_um[given.rows(3)], exact, atol=0.25 * np.nanstd(exact) + 0.1)
 
 
 def test_sensors_tell_what_the_batch_has_of_its_own():
