@@ -56,28 +56,43 @@ _FEWEST_WINDOWS = 4
 
 
 @dataclass(frozen=True)
-class Columns:
-    """Columns x (n, m) of a design, their names, and what sets their prior spread.
+class Column:
+    """A column of a design (n,): how far it reaches, and what sets the prior spread of its coefficient.
 
-    `prior_K` (m,) is the size that a column's coefficient is expected to have, relative to one per K; where `source`
-    (m,) is not −1, it is per full scale of that raw signal (inputs that are not in K, then the drivers), to the `power`
-    (m,): the largest size in training.
+    `prior_K` is the size that the coefficient is expected to have, relative to one per K; where `source` is not −1, it
+    is per full scale of that raw signal (inputs that are not in K, then the drivers), to the `power`: the largest size
+    in training.
     """
 
+    name: str
+    values: Array
+    prior_K: float = 1.0
+    source: int = -1
+    power: int = 1
+    reach: int = UNDRIVEN
+
+
+@dataclass(frozen=True)
+class Columns:
+    """All columns of a design, as x (n, m) relative to each batch's start."""
+
     x: Array
-    names: tuple[str, ...]
-    prior_K: Array
-    source: NDArray[np.int64]
-    power: Array
-    reach: NDArray[np.int64]
+    each: tuple[Column, ...]
     largest: Array  # (K, r) largest size of each raw signal in each batch
+
+    @property
+    def names(self) -> list[str]:
+        return [c.name for c in self.each]
+
+    @property
+    def reach(self) -> NDArray[np.int64]:
+        return np.array([c.reach for c in self.each], np.int64)
 
     def prior(self, train: Sequence[int]) -> Array:
         """Expected relative size of the coefficients (m,) for a training set."""
         largest = self.largest[list(train)].max(axis=0, initial=0.0)
-        full = np.where(largest > 0, largest, 1.0)
-        scale = np.append(full, 1.0)[self.source] ** self.power
-        return np.asarray(self.prior_K / scale)
+        full = np.append(np.where(largest > 0, largest, 1.0), 1.0)
+        return np.array([c.prior_K / full[c.source] ** c.power for c in self.each])
 
     @classmethod
     def of(cls, design: Design) -> Columns:
@@ -85,21 +100,10 @@ class Columns:
         drivers = design.drivers if design.driver_names else np.empty((len(design.time_s), 0))
         held = np.nan_to_num(np.abs(np.column_stack([design.x[:, scaled], drivers])))  # what has a full scale
         largest = np.array([held[design.rows(k)].max(axis=0, initial=0.0) for k in range(design.n_batches)])
-        parts = [*_inputs(design, scaled), *_drivers(design, drivers, len(scaled)), *_starts(design)]
-        x = np.column_stack([p.values for p in parts])
-        for k in range(design.n_batches):
-            rows = design.rows(k)
-            if rows.stop > rows.start:
-                x[rows] -= x[rows.start]
-        return cls(
-            x,
-            tuple(p.name for p in parts),
-            np.array([p.prior_K for p in parts]),
-            np.array([p.source for p in parts], np.int64),
-            np.array([float(p.power) for p in parts]),
-            np.array([p.reach for p in parts], np.int64),
-            largest.reshape(design.n_batches, held.shape[1]),
-        )
+        each = (*_inputs(design, scaled), *_drivers(design, drivers, len(scaled)), *_starts(design))
+        x = np.column_stack([c.values for c in each])
+        x -= x[design.offsets[design.group]]
+        return cls(x, each, largest.reshape(design.n_batches, held.shape[1]))
 
 
 def columns_program(b: Builder, inputs: Sequence[str], names: Sequence[str]) -> int:
@@ -135,21 +139,11 @@ def columns_program(b: Builder, inputs: Sequence[str], names: Sequence[str]) -> 
     return whole
 
 
-@dataclass(frozen=True)
-class _Column:
-    name: str
-    values: Array
-    prior_K: float = 1.0
-    source: int = -1
-    power: int = 1
-    reach: int = UNDRIVEN
-
-
-def _inputs(design: Design, scaled: Sequence[int]) -> list[_Column]:
+def _inputs(design: Design, scaled: Sequence[int]) -> list[Column]:
     source = {c: i for i, c in enumerate(scaled)}
     lags = lag_responses(design, bridged(design, design.x), [(0.0, tau_s) for tau_s in _LAGS_S], at_rest=False)
     return [
-        _Column(
+        Column(
             f"{name} after {lag_min:g} min",
             lags[:, i, c],
             _FULL_SCALE_K if c in source else 1.0,
@@ -161,13 +155,13 @@ def _inputs(design: Design, scaled: Sequence[int]) -> list[_Column]:
     ]
 
 
-def _drivers(design: Design, drivers: Array, first: int) -> list[_Column]:
+def _drivers(design: Design, drivers: Array, first: int) -> list[Column]:
     """Of the drivers (n, d), whose full scales are those from `first` on."""
     powers = [(d, power) for d, unit in enumerate(design.driver_units) for power in _powers(unit)]
     loads = np.abs(bridged(design, drivers))[:, [d for d, _ in powers]] ** np.array([float(m) for _, m in powers])
     lags = lag_responses(design, loads, [(0.0, tau_s) for tau_s in _LAGS_S])
     return [
-        _Column(f"{label} after {lag_min:g} min", lags[:, i, c], _FULL_SCALE_K, first + d, power, DRIVEN)
+        Column(f"{label} after {lag_min:g} min", lags[:, i, c], _FULL_SCALE_K, first + d, power, DRIVEN)
         for c, (d, power) in enumerate(powers)
         for label in [f"{design.driver_names[d]}^{power}" if power > 1 else design.driver_names[d]]
         for i, lag_min in enumerate(_LAGS_MIN)
@@ -179,9 +173,9 @@ def _powers(unit: str) -> tuple[int, ...]:
     return (1, 2) if unit == "rpm" else (1,)
 
 
-def _starts(design: Design) -> list[_Column]:
+def _starts(design: Design) -> list[Column]:
     """Columns of the state at the start; beyond the clock they need the batches themselves."""
-    out = [_Column(f"clock, gone in {g:g} min", _gone(design, g), _FULL_SCALE_K) for g in _CLOCK_GONE_MIN]
+    out = [Column(f"clock, gone in {g:g} min", _gone(design, g), _FULL_SCALE_K) for g in _CLOCK_GONE_MIN]
     channels = list(dict.fromkeys(name.partition("@")[0] for name in design.inputs))
     if not design.batches:
         return out
@@ -192,10 +186,10 @@ def _starts(design: Design) -> list[_Column]:
     level_degC = np.median(start_degC, axis=1)
     for g in _GONE_MIN:
         gone = _gone(design, g)
-        out.append(_Column(f"start level, gone in {g:g} min", (level_degC - _REFERENCE_DEGC)[design.group] * gone))
+        out.append(Column(f"start level, gone in {g:g} min", (level_degC - _REFERENCE_DEGC)[design.group] * gone))
         if len(thermal) > 1:
             away_K = (start_degC - level_degC[:, None])[design.group]
-            out += [_Column(f"{c} at start, gone in {g:g} min", away_K[:, i] * gone) for i, c in enumerate(thermal)]
+            out += [Column(f"{c} at start, gone in {g:g} min", away_K[:, i] * gone) for i, c in enumerate(thermal)]
     return out
 
 
@@ -278,7 +272,7 @@ class LagDictionary(Family):
                 learned.append(_Pooling(columns, windows.only(fold)).learn(None))
         return [
             self._learned(design, {
-                "columns": list(columns.names), **pooled,
+                "columns": columns.names, **pooled,
                 "mistrusted": [design.batch_ids[k] for k in pooled["mistrusted"]],
                 "n_rows": int(design.usable[np.isin(design.group, list(fold))].sum()),
             })

@@ -13,8 +13,8 @@ from features.design import Design
 from models.base import Family
 from models.linear import left_out_spread, mean_square, stated_sd_um
 from models.program import Builder
-from models.solvers.batches import fold_masks, only
-from models.solvers.lags import lag_responses
+from models.solvers.batches import fold_masks, only, padded, steps_s, unpadded
+from models.solvers.lags import behind
 from models.solvers.poles import (
     TAUS_S,
     Candidate,
@@ -95,11 +95,13 @@ class TransferFunction(Family):
         """NaN at a row where an input is missing, and throughout a batch that lacks a driver the model needs."""
         f, some = self.fitted, only(design, batches)
         parts = zip(f["kinds"], f["names"], f["exponents"], strict=True)
-        signals = [Source(kind, name, float(m)).signal(some)[:, None] for kind, name, m in parts]
-        error_um = np.full(len(some.time_s), f["intercept_um"])
-        for signal, direct, gains, taus_s in zip(signals, f["direct_um"], f["gain_um"], f["tau_s"], strict=True):
-            own = lag_responses(some, signal, [(0.0, 0.0), *((0.0, tau_s) for tau_s in taus_s)])[:, :, 0]
-            error_um += own @ np.array([direct, *gains])
+        signals = np.column_stack([Source(kind, name, float(m)).signal(some) for kind, name, m in parts])
+        laid, step_s = padded(some, signals), steps_s(some)
+        total_um = f["intercept_um"] + laid @ f["direct_um"]
+        for signal, gains_um, taus_s in zip(np.moveaxis(laid, 2, 0), f["gain_um"], f["tau_s"], strict=True):
+            for gain_um, tau_s in zip(gains_um, taus_s, strict=True):
+                total_um += gain_um * behind(signal, tau_s, step_s)
+        error_um = unpadded(some, total_um)
         error_um = np.where(np.isfinite(some.x).all(axis=1), error_um, np.nan)
         return [error_um[some.rows(k)] for k in range(some.n_batches)]
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from data.arrays import Array
 from features.design import Design
-from features.rises import lagged
 from models.solvers.batches import padded, steps_s, unpadded
 
 Response = tuple[float, float]
@@ -23,16 +22,19 @@ Response = tuple[float, float]
 def behind(laid: Array, tau_s: float, step_s: Array, before: Array | float = 0.0) -> Array:
     """τ dv/dt + v = u along batches as `padded` lays them out, (K, n, …), exact for u held over the step before it.
 
-    v is `before` (K, …) in the first row, of one row alone too. step_s (K,). A time constant of 0 gives u.
+    v is `before` (K, 1, …) in the first row, of one row alone too. step_s (K,). A time constant of 0 gives u.
     """
+    from scipy.signal import lfilter  # takes long to load
+
     if tau_s == 0:
         return laid
-    begin = np.broadcast_to(before, laid[:, 0].shape)
-    out = np.zeros_like(laid)
-    out[:, :1] = begin[:, None]
+    driven = laid - before
+    driven[:, :1] = 0.0
+    out = np.zeros_like(driven)
     for step, which in _by_step(step_s):
-        rows_first = laid[which].swapaxes(0, 1)
-        out[which] = lagged(rows_first, begin[which], float(np.exp(-step / tau_s))).swapaxes(0, 1)
+        keep = float(np.exp(-step / tau_s))
+        out[which] = lfilter([1.0 - keep], [1.0, -keep], driven[which], axis=1)
+    out += before
     return out
 
 
@@ -45,7 +47,7 @@ def lag_responses(
     batch's step is interpolated.
     """
     laid, step_s = padded(design, x), steps_s(design)
-    before = np.where(at_rest, 0.0, laid[:, 0])
+    before = np.where(at_rest, 0.0, laid[:, :1])
     out = np.empty((len(x), len(responses), x.shape[1]))
     for i, (delay_s, tau_s) in enumerate(responses):
         out[:, i] = unpadded(design, _delayed(behind(laid, tau_s, step_s, before), delay_s, step_s, before))
@@ -53,7 +55,7 @@ def lag_responses(
 
 
 def _delayed(laid: Array, delay_s: float, step_s: Array, before: Array) -> Array:
-    """Batches (K, n, p) a delay later, `before` (K, p) until then."""
+    """Batches (K, n, p) a delay later, `before` (K, 1, p) until then."""
     if delay_s == 0:
         return laid
     out = laid.copy()
@@ -61,7 +63,7 @@ def _delayed(laid: Array, delay_s: float, step_s: Array, before: Array) -> Array
         delay = delay_s / step
         whole = int(delay + 1e-9)
         part = delay - whole if delay - whole > 1e-6 else 0.0
-        still = np.repeat(before[which][:, None], whole + 1, axis=1)
+        still = np.repeat(before[which], whole + 1, axis=1)
         earlier = np.concatenate([still, laid[which]], axis=1)[:, : laid.shape[1] + 1]
         out[which] = (1.0 - part) * earlier[:, 1:] + part * earlier[:, :-1]
     return out
