@@ -27,7 +27,7 @@ from models.solvers.kernels import unit_scale
 from models.solvers.pooled_sums import AT_ONCE, Blocks, Path, Pool, fits, inner_sets, left_out_mean_S_um
 
 _ENOUGH_BATCHES, _ENOUGH_FOR_FORWARD = 3, 6
-_MOST_ROWS = 120  # of a batch that residuals are taken at
+_MOST_ROWS = 120  # of a batch that residuals are taken at: neighbours are redundant, and a fold must not cost rows
 _LEAST_SHARE = 0.01  # of the mean square residual, that a keeps: no recorded value is free of noise
 
 
@@ -46,10 +46,8 @@ def stated_sd_um(family: Family, design: Design, batches: Sequence[int]) -> list
     return [np.sqrt(a + b * mean_square(x[design.rows(k)], design)) for k in batches]
 
 
-def left_out_spread(
-    design: Design, square: Array, masks: Mask, scaled: bool, path: Path, chosen: NDArray[np.int64]
-) -> tuple[Array, Array]:
-    """(a, b) of variance = a + b · square for every training set, masks (F, K); NaN below three batches.
+def left_out_spread(task: Task, square: Array, path: Path, chosen: NDArray[np.int64]) -> tuple[Array, Array]:
+    """(a, b) of variance = a + b · square for every training set of a task, (F,) each; NaN below three batches.
 
     Every batch of a set is predicted by the set's own setting `chosen` (F,) of `path`, learned without that batch.
     a > 0 and b ≥ 0 are least squares of the squared residuals, then made larger until nine tenths of them lie inside
@@ -59,34 +57,25 @@ def left_out_spread(
     Args:
         square: what the variance grows with, on every row of the design, (n,).
     """
+    design, masks = task.design, task.masks
     a, b = np.full(len(masks), np.nan), np.full(len(masks), np.nan)
     many = np.flatnonzero(masks.sum(axis=1) >= _ENOUGH_BATCHES)
     if len(many):
-        rows = _judged_rows(design)
-        error = _left_out_um(design, rows, masks[many], scaled, path, chosen[many])
+        every = [np.flatnonzero(design.usable[design.rows(k)]) + design.offsets[k] for k in range(design.n_batches)]
+        rows = [own[:: -(-len(own) // _MOST_ROWS) or 1] for own in every]
+        error = _left_out_um(task, rows, masks[many], path, chosen[many])
         a[many], b[many] = _fitted(error**2, square[np.concatenate(rows)])
     return a, b
 
 
-def _judged_rows(design: Design) -> list[NDArray[np.int64]]:
-    """Usable rows of every batch, at most 120 each: neighbours are redundant, and a fold must not cost rows."""
-    every = [np.flatnonzero(design.usable[design.rows(k)]) + design.offsets[k] for k in range(design.n_batches)]
-    return [rows[:: -(-len(rows) // _MOST_ROWS) or 1] for rows in every]
-
-
 def _left_out_um(
-    design: Design,
-    rows: Sequence[NDArray[np.int64]],
-    masks: Mask,
-    scaled: bool,
-    path: Path,
-    chosen: NDArray[np.int64],
+    task: Task, rows: Sequence[NDArray[np.int64]], masks: Mask, path: Path, chosen: NDArray[np.int64]
 ) -> Array:
     """Residuals (F, m) at the m `rows` of all batches, each left out of its set; NaN where a set lacks the batch."""
-    moments = design.moments
+    design, moments = task.design, task.design.moments
     outer, left, sets, which = inner_sets(masks)
     coef, constant = np.empty((len(which), len(design.inputs))), np.empty(len(which))
-    for here, at, pool, found in fits(Blocks.of(moments), sets, which, scaled, path):
+    for here, at, pool, found in fits(task.blocks, sets, which, task.scaled, path):
         coef[here] = found[at, :, chosen[outer[here]]]
         mean_x, mean_y = pool.mean_x[at] + moments.shift_x, pool.mean_y[at] + moments.shift_y
         constant[here] = mean_y - np.einsum("vj,vj->v", mean_x, coef[here])
@@ -301,7 +290,7 @@ class Linear(Family):
         if not self.has_sd:
             return {}
         square = mean_square(task.design.x, task.design)
-        a, b = left_out_spread(task.design, square, task.masks, task.scaled, path, chosen)
+        a, b = left_out_spread(task, square, path, chosen)
         return {"variance_um2": a, "variance_growth_um2": b}
 
 

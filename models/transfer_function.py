@@ -11,22 +11,24 @@ from data.arrays import Array, Mask
 from data.errors import InputError
 from features.design import Design
 from models.base import Family
-from models.linear import left_out_spread, mean_square, stated_sd_um
+from models.linear import Task, left_out_spread, mean_square, stated_sd_um
 from models.program import Builder
 from models.solvers.batches import fold_masks, only, padded, steps_s, unpadded
 from models.solvers.lags import behind
 from models.solvers.poles import (
+    PENALTIES,
     TAUS_S,
     Candidate,
     Dictionary,
     Search,
     Source,
+    candidate_path,
     combination,
     drivers_of,
     gaps_of,
     refined,
 )
-from models.solvers.pooled_sums import Blocks, ridge_path
+from models.solvers.pooled_sums import Blocks
 
 _FEWEST_ROWS = 8
 _MOST_INPUTS = 60
@@ -84,11 +86,14 @@ class TransferFunction(Family):
         gaps = gaps_of(design) if self.gaps else []
         sources = (*(Source("input", i) for i in design.inputs), *drivers, *gaps)
         dictionary = Dictionary(design, sources, about_start=self.zero_start)
-        best, penalty = self._chosen(dictionary, masks)
+        best, many = [Candidate()] * len(masks), np.flatnonzero(masks.sum(axis=1) >= _ENOUGH_BATCHES)
+        if len(many):
+            for f, candidate in zip(many, Search(dictionary, masks[many]).run(self.poles), strict=True):
+                best[f] = candidate
         out: dict[int, Self] = {}
         for candidate in dict.fromkeys(best):
             some = [f for f, own in enumerate(best) if own == candidate]
-            out |= zip(some, self._fitted(dictionary, masks[some], candidate, penalty[some]), strict=True)
+            out |= zip(some, self._fitted(dictionary, masks[some], candidate), strict=True)
         return [out[f] for f in range(len(folds))]
 
     def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
@@ -125,31 +130,20 @@ class TransferFunction(Family):
             return 0
         return len(self.fitted["names"]) + 2 * int(np.size(self.fitted["tau_s"])) + (not self.zero_start)
 
-    def _chosen(self, dictionary: Dictionary, masks: Mask) -> tuple[list[Candidate], Array]:
-        """Candidate and penalty of every fold."""
-        best, penalty = [Candidate()] * len(masks), np.zeros(len(masks))
-        many = masks.sum(axis=1) >= _ENOUGH_BATCHES
-        if many.any():
-            found, penalty[many] = Search(dictionary, dictionary.table.moments, masks[many]).run(self.poles)
-            for f, candidate in zip(np.flatnonzero(many), found, strict=True):
-                best[f] = candidate
-        if not many.all():
-            quarters = dictionary.table.quarters
-            blocks = np.repeat(masks[~many], 4, axis=1) & (quarters.count > 0)
-            penalty[~many] = Search(dictionary, quarters, blocks).penalties(Candidate())
-        return best, penalty
-
-    def _fitted(self, dictionary: Dictionary, masks: Mask, candidate: Candidate, penalty: Array) -> list[Self]:
-        """The folds that chose one candidate, their poles moved."""
+    def _fitted(self, dictionary: Dictionary, masks: Mask, candidate: Candidate) -> list[Self]:
+        """The folds that chose one candidate: its penalty, then its poles moved."""
         design, moments = dictionary.design, dictionary.table.moments
         which = candidate.sources(dictionary)
+        own = map(str, dictionary.places(which, candidate.poles))
+        task = Task.of(dictionary.table.subset(tuple(own)), masks, False)
+        chosen = task.chosen(candidate_path, "leave_batch_out")
         sources, columns = [dictionary.sources[i] for i in which], dictionary.block(which)
         direct = np.array([s.direct for s in sources])
         blocks = Blocks.of(moments.subset(columns))
         pool = blocks.pool(masks, False)
         square = masks @ (blocks.yy + blocks.count * blocks.mean_y**2) - pool.count * pool.mean_y**2
         shared = np.tile(np.log(TAUS_S[list(candidate.poles)]), (len(masks), 1))
-        log_tau, gain = refined(pool, square, direct, shared, penalty, pool.count / masks.sum(axis=1))
+        log_tau, gain = refined(pool, square, direct, shared, PENALTIES[chosen], pool.count / masks.sum(axis=1))
         weight, _ = combination(log_tau, direct)
         away = ((pool.mean_x + moments.shift_x[columns])[:, None, :] @ weight @ gain[:, :, None])[:, 0, 0]
         intercept = pool.mean_y + moments.shift_y - away
@@ -159,30 +153,14 @@ class TransferFunction(Family):
         gain_um = gain[:, n_direct:].reshape(len(masks), -1, len(sources)).transpose(0, 2, 1)
         plain = {"kinds": [s.kind for s in sources], "names": [s.name for s in sources],
                  "exponents": np.array([s.exponent for s in sources])}  # fmt: skip
-        spread = self._spread(dictionary, masks, candidate, penalty)
+        # For `sd_um`: left-out residuals with the poles where the candidate has them.
+        grows = mean_square(self.started(design).x, design)
+        spread = np.transpose(left_out_spread(task, grows, candidate_path, chosen)).tolist()
+        names = ("variance_um2", "variance_growth_um2")
         return [
             self._learned(design, {**plain, "direct_um": direct_um[f], "gain_um": gain_um[f],
                                    "tau_s": np.exp(log_tau[f]), "intercept_um": float(intercept[f]),
-                                   "k": float(penalty[f]), **spread[f]})
+                                   "k": float(PENALTIES[chosen[f]]),
+                                   **(dict(zip(names, spread[f], strict=True)) if np.isfinite(spread[f][0]) else {})})
             for f in range(len(masks))
         ]  # fmt: skip
-
-    def _spread(
-        self, dictionary: Dictionary, masks: Mask, candidate: Candidate, penalty: Array
-    ) -> list[dict[str, float]]:
-        """Coefficients for `sd_um`, from left-out residuals with the poles where the candidate has them."""
-        names = map(str, dictionary.places(candidate.sources(dictionary), candidate.poles))
-        tried, chosen = np.unique(penalty, return_inverse=True)
-        square = mean_square(self.started(dictionary.design).x, dictionary.design)
-        spread = left_out_spread(
-            dictionary.table.subset(tuple(names)),
-            square,
-            masks,
-            False,
-            lambda pool: ridge_path(pool.xx, pool.xy, tried),
-            chosen,
-        )
-        return [
-            {"variance_um2": float(a), "variance_growth_um2": float(b)} if np.isfinite(a) else {}
-            for a, b in zip(*spread, strict=True)
-        ]

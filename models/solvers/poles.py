@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.arrays import Array, Mask
-from features.design import Design, Moments
+from features.design import Design
 from features.rises import hold_last
 from models.linear import EPS
 from models.program import Builder
@@ -215,14 +215,14 @@ class Candidate:
 
 
 class Search:
-    """The best candidate and penalty of every training set, masks (F, B) over the dictionary's blocks of rows."""
+    """The best candidate of every training set, masks (F, K)."""
 
-    def __init__(self, dictionary: Dictionary, moments: Moments, masks: Mask) -> None:
-        self.dictionary, self.moments, self.masks = dictionary, moments, masks
+    def __init__(self, dictionary: Dictionary, masks: Mask) -> None:
+        self.dictionary, self.masks = dictionary, masks
         self._scores: dict[Candidate, Array] = {}
 
-    def run(self, n_poles: int) -> tuple[list[Candidate], Array]:
-        """A candidate and a penalty k (F,) per set."""
+    def run(self, n_poles: int) -> list[Candidate]:
+        """A candidate per set."""
         exponents = tuple(dict.fromkeys(s.exponent for s in self.dictionary.sources if s.kind in DRIVERS))
         least = _BATCHES_PER_GAP * sum(s.kind == "gap" for s in self.dictionary.sources)
         start = Candidate((), exponents[0] if exponents else 0.0)
@@ -234,16 +234,7 @@ class Search:
         best = self._better(best, lambda c: [c, replace(c, gaps=False)])
         if exponents:
             best = self._better(best, lambda c: [c, *(replace(c, exponent=m) for m in (0.0, *exponents))])
-        penalty = np.zeros(len(self.masks))
-        for candidate in dict.fromkeys(best):
-            some = [f for f, own in enumerate(best) if own == candidate]
-            penalty[some] = self.penalties(candidate, some)
-        return best, penalty
-
-    def penalties(self, candidate: Candidate, sets: Sequence[int] | None = None) -> Array:
-        """The best k of a candidate for some of the sets, None all."""
-        masks = self.masks if sets is None else self.masks[list(sets)]
-        return PENALTIES[np.argmin(self._left_out(candidate, masks, PENALTIES), axis=1)]
+        return best
 
     def _better(self, best: Sequence[Candidate], others: Callable[[Candidate], list[Candidate]]) -> list[Candidate]:
         """The alternative of least score for every set, next to its best; equal scores keep the first."""
@@ -255,14 +246,20 @@ class Search:
         for candidate, sets in sets_of.items():
             score = self._scores.setdefault(candidate, np.full(len(best), np.nan))
             if new := [f for f in sets if np.isnan(score[f])]:
-                score[new] = self._left_out(candidate, self.masks[new], _FEW_PENALTIES).min(axis=1)
+                columns = self.dictionary.places(candidate.sources(self.dictionary), candidate.poles)
+                blocks = Blocks.of(self.dictionary.table.moments.subset(columns))
+                left_um = left_out_mean_S_um(blocks, self.masks[new], False, _few_penalties_path)
+                score[new] = left_um.min(axis=1)
         return [c[int(np.argmin([self._scores[one][f] for one in c]))] for f, c in enumerate(tried)]
 
-    def _left_out(self, candidate: Candidate, masks: Mask, penalties: Array) -> Array:
-        columns = self.dictionary.places(candidate.sources(self.dictionary), candidate.poles)
-        return left_out_mean_S_um(
-            Blocks.of(self.moments.subset(columns)), masks, False, lambda pool: ridge_path(pool.xx, pool.xy, penalties)
-        )
+
+def candidate_path(pool: Pool) -> Array:
+    """Ridge coefficients of a candidate's columns for all of `PENALTIES`."""
+    return ridge_path(pool.xx, pool.xy, PENALTIES)
+
+
+def _few_penalties_path(pool: Pool) -> Array:
+    return ridge_path(pool.xx, pool.xy, _FEW_PENALTIES)
 
 
 def _second_pole(c: Candidate) -> list[Candidate]:
