@@ -21,6 +21,7 @@ from models.distributed_lag import (
 )
 from models.linear import Task
 from models.solvers.lags import lag_responses
+from thermodrift.testing.runs import stack
 
 SIZES = (60, 45, 52, 40, 57)
 
@@ -37,10 +38,8 @@ def make_design(law=None, p=2, noise_um=0.0, seed=0, step_s=300.0) -> Design:
     rng = np.random.default_rng(seed)
     parts = [rises(n, p, rng, step_s) for n in SIZES]
     y = np.concatenate([law(x) if law else 2 * x[:, 0] - x[:, -1] for x in parts])
-    names = tuple(f"t{j}" for j in range(p))
-    return Design(names, "z", tuple(f"K{k + 1}" for k in range(len(SIZES))), np.vstack(parts),
-                  y + rng.normal(0, noise_um, len(y)), np.concatenate([np.arange(n) * step_s for n in SIZES]),
-                  np.concatenate([[0], np.cumsum(SIZES)]).astype(np.int64), step_s)  # fmt: skip
+    design = stack(np.vstack(parts), y + rng.normal(0, noise_um, len(y)), list(SIZES))
+    return replace(design, time_s=np.concatenate([np.arange(n) * step_s for n in SIZES]), step_s=step_s)
 
 
 def shifted(x, rows, before=0.0):
@@ -62,6 +61,25 @@ def ridge(x, y, k):
     matrix += k * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
     beta = np.linalg.solve(matrix, centred.T @ (y - y.mean()))
     return beta, y.mean() - x.mean(0) @ beta
+
+
+def best_by_refits(design, splits):
+    """Order and penalty of least mean S over (rows to fit on, rows to predict); lags are three rows apart."""
+    S_um = {}
+    for q in (0, 1, 2, 3):
+        table = table_of(design, [3 * lag for lag in range(q + 1)])
+        for k in RIDGES:
+            left = []
+            for rest, out in splits:
+                beta, constant = ridge(table[rest], design.y_um[rest], k)
+                e = design.y_um[out] - table[out] @ beta - constant
+                left.append(np.sqrt(e @ e / (len(e) - 1)))
+            S_um[q, k] = np.mean(left)
+    return min(S_um, key=S_um.get)
+
+
+def rows_of(design, fold):
+    return [np.arange(design.offsets[k], design.offsets[k + 1]) for k in fold]
 
 
 def test_responses_are_shifts_and_first_order_lags_of_each_batch_alone():
@@ -96,33 +114,32 @@ def test_holes_are_bridged_and_a_missing_input_is_nan():
     assert np.isfinite(own).all() and np.isnan(other).all()
 
 
-@pytest.mark.parametrize("lags", ["free", "almon"])
-def test_a_planted_law_of_lags_is_found(lags):
-    # Four lags of 20 min: two inputs whose weights lie on a straight line over the lags.
-    weights = np.array([[3.0, -1.0], [2.0, -0.5], [1.0, 0.0], [0.0, 0.5]])
-    design = make_design(lambda x: sum(shifted(x, 4 * lag) @ w for lag, w in enumerate(weights)), seed=4)
-    model = DistributedLag(lags, lag_min=20, max_lags=3, degree=1).fit_design(design, [0, 1, 2, 3])
+LINE = np.array([[3.0, -1.0], [2.0, -0.5], [1.0, 0.0], [0.0, 0.5]])  # weights of two inputs, on a line over the lags
+
+
+def over_lags(x):
+    return sum(shifted(x, 4 * lag) @ w for lag, w in enumerate(LINE))
+
+
+def koyck(x):
+    """Koyck's transformed equation run free, y_t = λ y_(t−1) + 4 (1 − λ) x_t, and a direct part −1.5 x_t."""
+    keep, y = np.exp(-300 / KOYCK_TAUS_S[3]), np.zeros(len(x))
+    for t in range(1, len(x)):
+        y[t] = keep * y[t - 1] + 4 * (1 - keep) * x[t, 0]
+    return y - 1.5 * x[:, 0]
+
+
+@pytest.mark.parametrize(("law", "options", "p", "weights", "delays_s", "taus_s"), [
+    (over_lags, {"lags": "free", "lag_min": 20, "max_lags": 3}, 2, LINE, [0, 1200, 2400, 3600], [0] * 4),
+    (over_lags, {"lags": "almon", "lag_min": 20, "max_lags": 3, "degree": 1}, 2, LINE, [0, 1200, 2400, 3600], [0] * 4),
+    (koyck, {}, 1, [[-1.5], [4.0]], [0, 0], [0, KOYCK_TAUS_S[3]]),
+])  # fmt: skip
+def test_a_planted_law_is_found(law, options, p, weights, delays_s, taus_s):
+    design = make_design(law, p, seed=4)
+    model = DistributedLag(**options).fit_design(design, [0, 1, 2, 3])
     np.testing.assert_allclose(model.predict_design(design, [4])[0], design.y_um[design.rows(4)], atol=1e-3)
     np.testing.assert_allclose(model.fitted["weights_um_per_K"], weights, atol=1e-3)
-    np.testing.assert_array_equal(model.fitted["delays_s"], [0, 1200, 2400, 3600])
-
-
-def test_a_planted_geometric_lag_is_found_with_its_decay():
-    tau_s = KOYCK_TAUS_S[3]
-    keep = np.exp(-300 / tau_s)
-
-    def law(x):
-        # Koyck's transformed equation run free: y_t = λ y_(t−1) + 4 (1 − λ) x_t, and a direct part −1.5 x_t.
-        y = np.zeros(len(x))
-        for t in range(1, len(x)):
-            y[t] = keep * y[t - 1] + 4 * (1 - keep) * x[t, 0]
-        return y - 1.5 * x[:, 0]
-
-    design = make_design(law, p=1, seed=5)
-    model = DistributedLag().fit_design(design, [0, 1, 2, 3])
-    np.testing.assert_array_equal(model.fitted["taus_s"], [0, tau_s])
-    np.testing.assert_allclose(model.fitted["weights_um_per_K"][:, 0], [-1.5, 4.0], atol=1e-4)
-    np.testing.assert_allclose(model.predict_design(design, [4])[0], design.y_um[design.rows(4)], atol=1e-4)
+    np.testing.assert_array_equal([model.fitted["delays_s"], model.fitted["taus_s"]], [delays_s, taus_s])
 
 
 def test_no_lag_where_none_is():
@@ -138,23 +155,11 @@ def test_no_lag_where_none_is():
 def test_the_choice_is_the_brute_force_choice(fold):
     design = make_design(lambda x: x[:, 0] + 2 * shifted(x[:, 1], 6), noise_um=2.0, seed=7)
     fitted = DistributedLag("free", lag_min=15, max_lags=3).as_published().fit_design(design, fold).fitted
-    parts = [np.arange(design.offsets[k], design.offsets[k + 1]) for k in fold]
+    parts, rows = rows_of(design, fold), np.concatenate(rows_of(design, fold))
     if len(fold) < 3:
         parts = [part[(np.arange(len(part)) * 4) // len(part) == q] for part in parts for q in range(4)]
-    S_um = {}
-    for q in (0, 1, 2, 3):
-        table = table_of(design, [3 * lag for lag in range(q + 1)])
-        for k in RIDGES:
-            left = []
-            for out in parts:
-                rest = np.setdiff1d(np.concatenate(parts), out)
-                beta, constant = ridge(table[rest], design.y_um[rest], k)
-                e = design.y_um[out] - table[out] @ beta - constant
-                left.append(np.sqrt(e @ e / (len(e) - 1)))
-            S_um[q, k] = np.mean(left)
-    best = min(S_um, key=S_um.get)
+    best = best_by_refits(design, [(np.setdiff1d(rows, out), out) for out in parts])
     assert (len(fitted["delays_s"]) - 1, fitted["k"]) == best
-    rows = np.concatenate([np.arange(design.offsets[k], design.offsets[k + 1]) for k in fold])
     table = table_of(design, [3 * lag for lag in range(best[0] + 1)])
     beta, constant = ridge(table[rows], design.y_um[rows], best[1])
     np.testing.assert_allclose(fitted["weights_um_per_K"].ravel(), beta, atol=1e-6)
@@ -187,8 +192,7 @@ def task_of(design, folds):
 @pytest.mark.parametrize("order_by", ["aic", "bic"])
 def test_the_criteria_count_parameters_and_effective_rows(order_by):
     design = make_design(noise_um=1.0, seed=9)
-    columns = Design(tuple("abcdef"), "z", design.batch_ids, table_of(design, [0, 3, 6]), design.y_um, design.time_s,
-                     design.offsets, 300.0)  # fmt: skip
+    columns = stack(table_of(design, [0, 3, 6]), design.y_um, list(SIZES))
     task = task_of(columns, [[0, 1, 2, 3, 4], [1, 2, 3]])
     got = criterion(task, lag_shapes(2, 2), order_by)
     for f, fold in enumerate([[0, 1, 2, 3, 4], [1, 2, 3]]):
@@ -214,9 +218,7 @@ def test_effective_rows_of_residuals_with_a_known_memory():
     e = np.zeros((3, n))
     for t in range(1, n):
         e[:, t] = 0.8 * e[:, t - 1] + rng.normal(size=3)
-    x, time_s = rng.normal(size=(3 * n, 1)), np.tile(np.arange(n) * 60.0, 3)
-    design = Design(("t",), "z", ("a", "b", "c"), x, e.ravel(), time_s,
-                    np.arange(4, dtype=np.int64) * n, 60.0)  # fmt: skip
+    design = stack(rng.normal(size=(3 * n, 1)), e.ravel(), [n] * 3)
     rho, rows = effective_rows(task_of(design, [[0, 1, 2]]), np.zeros((1, 1)))
     assert rho[0] == pytest.approx(0.8, abs=0.02)
     assert rows[0] == pytest.approx(3 * n / 9, rel=0.12)
@@ -233,9 +235,8 @@ def test_a_model_learned_at_one_step_holds_at_another(lags):
         parts = [x[::every] for x in fine]
         y = np.concatenate([2 * x[:, 0] + shifted(x[:, 1], 60 // every) for x in parts])
         sizes = [len(x) for x in parts]
-        return Design(("a", "b"), "z", tuple("VWXYZ"), np.vstack(parts), y,
-                      np.concatenate([np.arange(n) * 60.0 * every for n in sizes]),
-                      np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64), 60.0 * every)  # fmt: skip
+        design = stack(np.vstack(parts), y, sizes)
+        return replace(design, time_s=design.time_s / 5 * every, step_s=60.0 * every)
 
     coarse, close = design_of(5), design_of(1)
     model = DistributedLag(lags).fit_design(coarse, [0, 1, 2, 3])
@@ -277,19 +278,9 @@ def test_the_choice_looks_forward_whatever_the_order_of_the_batches():
     design = Design.build(runs, ("a", "b"), "z")
     family = DistributedLag("free", lag_min=15, max_lags=3, order_by="forward").as_published()
     fitted = family.fit_design(design, range(9)).fitted
-    parts = [np.arange(design.offsets[k], design.offsets[k + 1]) for k in range(9)]
-    S_um = {}
-    for q in (0, 1, 2, 3):
-        table = table_of(design, [3 * lag for lag in range(q + 1)])
-        for k in RIDGES:
-            left = []
-            for now in range(2, 9):
-                past = np.concatenate(parts[:now])
-                beta, constant = ridge(table[past], design.y_um[past], k)
-                e = design.y_um[parts[now]] - table[parts[now]] @ beta - constant
-                left.append(np.sqrt(e @ e / (len(e) - 1)))
-            S_um[q, k] = np.mean(left)
-    assert (len(fitted["delays_s"]) - 1, fitted["k"]) == min(S_um, key=S_um.get)
+    parts = rows_of(design, range(9))
+    splits = [(np.concatenate(parts[:now]), parts[now]) for now in range(2, 9)]
+    assert (len(fitted["delays_s"]) - 1, fitted["k"]) == best_by_refits(design, splits)
     order = np.random.default_rng(3).permutation(9)
     shuffled = Design.build([runs[k] for k in order], ("a", "b"), "z")
     again = family.fit_design(shuffled, range(9)).fitted
