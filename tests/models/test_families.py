@@ -43,6 +43,10 @@ def test_keys_are_those_of_the_registry() -> None:
     ("distributed_lag", {"lag_min": 0}, "expected lag_min above 0"),
     ("transfer_function", {"poles": 3}, "family transfer_function: poles is 3, expected 0, 1 or 2; choose one"),
     ("axis_coupled", {"max_terms": 1}, r"max_terms 1, worth 0.01; expected at least 2 terms and 0 <= worth < 1"),
+    ("twin", {"start": "warm"}, "start is 'warm', expected 'usual' or 'settled'"),
+    ("twin_residual", {"residual": "forest"}, "residual is 'forest', expected ridge or gp"),
+    ("twin_kalman", {"residual": "gp"}, "residual is 'gp', expected ridge or none"),
+    ("twin_kalman", {"heat_spread": -1}, "heat_spread is -1"),
     ("gm1n", {"response": "whitenin"}, "did you mean 'whitening'"),
     ("gm_dl", {"banded": "bath"}, "unknown banded 'bath': did you mean 'both'"),
     ("gm_dl", {"bands": 0}, "bands 0, least_batches 4; expected at least 1"),
@@ -85,13 +89,14 @@ def by_hand() -> Design:
                   made.step_s, input_units=made.input_units)  # fmt: skip
 
 
-@pytest.mark.parametrize("key", [
-    "mlr", "ridge", "pcr", "pcr_lbo", "pls", "bp", "bp_linear", "gaussian_process", "transfer_function",
+@pytest.mark.parametrize(("key", "options"), [
+    *((key, {}) for key in ("mlr", "ridge", "pcr", "pcr_lbo", "pls", "bp", "bp_linear", "gaussian_process")),
+    ("transfer_function", {}), ("transfer_function", {"drivers": True}),
 ])  # fmt: skip
 @pytest.mark.parametrize("form", ["default", "published"])
-def test_all_folds_at_once_are_the_folds_one_by_one(key: str, form: str) -> None:
+def test_all_folds_at_once_are_the_folds_one_by_one(key: str, options: dict[str, Any], form: str) -> None:
     """Folds that share work with others, and folds unlike all others, of runs of different lengths."""
-    design, family = runs.design(False), FAMILIES[key]()
+    design, family = runs.design(False), FAMILIES[key](**options)
     family = family if form == "default" else family.as_published()
     short = (design.group == 1) & (np.arange(len(design.x)) >= design.offsets[2] - runs.N // 3)
     design = replace(design, y_um=np.where(short, np.nan, design.y_um))

@@ -1,5 +1,7 @@
 """Linear families from moments, held against direct fits on the rows by numpy and scikit-learn."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sklearn.cross_decomposition import PLSRegression
@@ -16,6 +18,7 @@ from models.mlr import MLR
 from models.pcr import PCR, PCRByLeaveBatchOut
 from models.pls import PLS
 from models.ridge import Ridge
+from thermodrift.testing.runs import stack
 
 LINEAR = [MLR, Ridge, PCR, PCRByLeaveBatchOut, PLS]
 K, N, P = 8, 60, 6
@@ -25,7 +28,6 @@ FOLDS = [[j for j in range(K) if j != k] for k in range(K)] + [[k] for k in rang
 def make_design(seed=0, quantum_K=0.1, x=None, y_um=None, units=()) -> Design:
     """Collinear rises of a warming machine: four modes, rounded like the instruments', VIF 10³–10⁴."""
     rng = np.random.default_rng(seed)
-    time_s = np.tile(np.arange(N) * 300.0, K)
     tau_s = np.array([0.5, 1.5, 4.0, 10.0]) * 3600
     gains, weights = rng.uniform(0.3, 1, (4, P)), np.array([1.5, 2.0, -1.0, 3.0])
     parts, errors = [], []
@@ -37,9 +39,7 @@ def make_design(seed=0, quantum_K=0.1, x=None, y_um=None, units=()) -> Design:
         errors.append(np.round(load @ weights + 2 * room + rng.normal(0, 1, N)))
         errors[-1] -= errors[-1][0]
     x = np.vstack(parts) if x is None else x
-    return Design(tuple(f"T{j}" for j in range(x.shape[1])), "z_um", tuple(f"K{k + 1}" for k in range(K)), x,
-                  np.concatenate(errors) if y_um is None else y_um, time_s, np.arange(K + 1, dtype=np.int64) * N,
-                  300.0, input_units=units)  # fmt: skip
+    return replace(stack(x, np.concatenate(errors) if y_um is None else y_um, [N] * K), input_units=units)
 
 
 def predicted(model, design) -> np.ndarray:
@@ -138,11 +138,8 @@ def test_pcr_with_all_components_is_the_least_squares_of_minimum_norm(doubled):
 def test_pcr_by_hand():
     # Two uncorrelated inputs of variance 8 and 2: contributions 0.8 and 0.2; y = 3 x1 + 5 x2 + 7.
     x = np.array([[4, 2], [4, -2], [-4, 2], [-4, -2]]) * np.sqrt([0.5, 0.5]) + [10.0, 20.0]
-    design = Design(("a", "b"), "z_um", ("K1",), x, x @ [3.0, 5.0] + 7, np.arange(4.0), np.array([0, 4]), 1.0)
-    one, two = (
-        PCR(0.79).as_published().fit_design(design, [0]).fitted,
-        PCR(0.81).as_published().fit_design(design, [0]).fitted,
-    )
+    design = stack(x, x @ [3.0, 5.0] + 7, [4])
+    one, two = (PCR(share).as_published().fit_design(design, [0]).fitted for share in (0.79, 0.81))
     np.testing.assert_allclose(one["coef_um_per_K"], [3, 0], atol=1e-12)
     assert one["intercept_um"] == pytest.approx(5 * 20 + 7)  # the dropped input rests at its mean
     assert (one["n_components"], one["contribution"]) == (1, pytest.approx(0.8))
@@ -227,7 +224,7 @@ def test_a_shifted_or_stretched_error_gives_a_shifted_or_stretched_prediction(cl
 @pytest.mark.parametrize("cls", LINEAR)
 def test_a_subset_of_the_design_is_a_design_of_its_own(cls):
     design = make_design(4)
-    sub, own = design.subset(("T4", "T1")), make_design(4, x=design.x[:, [4, 1]])
+    sub, own = design.subset(("t4", "t1")), make_design(4, x=design.x[:, [4, 1]])
     for fold in (FOLDS[1], [6]):
         near(published(cls, sub, fold), published(cls, own, fold))
 
@@ -239,8 +236,7 @@ def test_rows_with_a_hole_are_left_out_of_the_fit_and_stay_holes_in_the_predicti
     x[5:9, 2], y_um[70:80] = np.nan, np.nan
     holed = make_design(5, x=x, y_um=y_um)
     keep = holed.usable
-    offsets = np.concatenate([[0], np.cumsum([keep[design.rows(k)].sum() for k in range(K)])])
-    cut = Design(holed.inputs, "z_um", holed.batch_ids, x[keep], y_um[keep], holed.time_s[keep], offsets, 300.0)
+    cut = stack(x[keep], y_um[keep], [keep[design.rows(k)].sum() for k in range(K)])
     for fold in ([0, 1, 2, 3], [0]):
         p = published(cls, holed, fold)
         near(p[keep], published(cls, cut, fold))
