@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Self
 
@@ -176,22 +177,22 @@ def shaped_path(shapes: Sequence[Array], pool: Pool) -> Array:
     """Coefficients (S, m p, G) of all responses for every shape with each of `RIDGES`; columns response by response."""
     path = np.zeros((*pool.xy.shape, len(shapes) * len(RIDGES)))
     for s, shape in enumerate(shapes):
-        at, mix, xx, xy = _free(shape, pool)
-        coef = ridge_path(xx, xy, RIDGES)
+        at, mix, free = _free(shape, pool)
+        coef = ridge_path(free, RIDGES)
         path[:, at, s * len(RIDGES) : (s + 1) * len(RIDGES)] = coef if mix is None else mix @ coef
     return path
 
 
-def _free(shape: Array, pool: Pool) -> tuple[NDArray[np.int64], Array | None, Array, Array]:
-    """Columns of a shape, how they mix the free coefficients (None: not at all), and sums xx and xy of these."""
+def _free(shape: Array, pool: Pool) -> tuple[NDArray[np.int64], Array | None, Pool]:
+    """Columns of a shape, how they mix the free coefficients (None: not at all), and the sums of these."""
     used = np.flatnonzero(shape.any(axis=1))
     p = pool.xy.shape[1] // len(shape)
     at: NDArray[np.int64] = (used[:, None] * p + np.arange(p)).ravel()
     xx, xy = pool.xx[:, at[:, None], at], pool.xy[:, at]
     if len(used) == shape.shape[1]:
-        return at, None, xx, xy
+        return at, None, replace(pool, xx=xx, xy=xy)
     mix: Array = np.kron(shape[used], np.eye(p)).astype(float)
-    return at, mix, mix.T @ xx @ mix, xy @ mix
+    return at, mix, replace(pool, xx=mix.T @ xx @ mix, xy=xy @ mix)
 
 
 def criterion(task: Task, shapes: Sequence[Array], order_by: str) -> Array:
@@ -199,7 +200,7 @@ def criterion(task: Task, shapes: Sequence[Array], order_by: str) -> Array:
     pool, blocks = task.pool, task.blocks
     path = shaped_path(shapes, pool)
     parameters = []
-    for xx in (_free(shape, pool)[2] for shape in shapes):
+    for xx in (_free(shape, pool)[2].xx for shape in shapes):
         values, ridge = np.linalg.eigvalsh(xx)[:, :, None], mean_diagonal(xx)[:, None, None] * RIDGES
         parameters.append(1.0 + (values / (values + ridge)).sum(axis=1))
     fold, block = np.nonzero(task.masks)

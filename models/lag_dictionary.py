@@ -24,6 +24,7 @@ from scipy import stats
 from scipy.optimize import nnls
 
 from data.arrays import Array
+from data.checks.base import THERMAL
 from data.errors import InputError
 from features.design import Design
 from features.rises import first_finite
@@ -43,7 +44,6 @@ _CLOCK_GONE_MIN = (10.0, *_GONE_MIN)
 _REFERENCE_DEGC = 20.0
 _FULL_SCALE_K = 10.0  # a driver at full scale, and the clock, count like a rise of so many K
 _KELVIN = ("K", "degC")
-_THERMAL = ("temperature", "ambient")
 
 
 _LEVELS = (0.1, 10.0, 1000.0)  # prior variance of a gain per K, in units of what no column explains
@@ -179,7 +179,7 @@ def _starts(design: Design) -> list[Column]:
     channels = list(dict.fromkeys(name.partition("@")[0] for name in design.inputs))
     if not design.batches:
         return out
-    thermal = [c for c in channels if design.batches[0].channels[c].role in _THERMAL]
+    thermal = [c for c in channels if design.batches[0].channels[c].role in THERMAL]
     if not thermal:
         return out
     start_degC = np.array([[first_finite(b.masked(c)) for c in thermal] for b in design.batches])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Self
 
 import numpy as np
@@ -22,13 +23,12 @@ from models.solvers.poles import (
     Dictionary,
     Search,
     Source,
-    candidate_path,
     combination,
     drivers_of,
     gaps_of,
     refined,
 )
-from models.solvers.pooled_sums import Blocks
+from models.solvers.pooled_sums import Blocks, ridge_path
 
 _FEWEST_ROWS = 8
 _MOST_INPUTS = 60
@@ -136,7 +136,8 @@ class TransferFunction(Family):
         which = candidate.sources(dictionary)
         own = map(str, dictionary.places(which, candidate.poles))
         task = Task.of(dictionary.table.subset(tuple(own)), masks, False)
-        chosen = task.chosen(candidate_path, "leave_batch_out")
+        path = partial(ridge_path, penalties=PENALTIES)
+        chosen = task.chosen(path, "leave_batch_out")
         sources, columns = [dictionary.sources[i] for i in which], dictionary.block(which)
         direct = np.array([s.direct for s in sources])
         blocks = Blocks.of(moments.subset(columns))
@@ -155,7 +156,7 @@ class TransferFunction(Family):
                  "exponents": np.array([s.exponent for s in sources])}  # fmt: skip
         # For `sd_um`: left-out residuals with the poles where the candidate has them.
         grows = mean_square(self.started(design).x, design)
-        spread = np.transpose(left_out_spread(task, grows, candidate_path, chosen)).tolist()
+        spread = np.transpose(left_out_spread(task, grows, path, chosen)).tolist()
         names = ("variance_um2", "variance_growth_um2")
         return [
             self._learned(design, {**plain, "direct_um": direct_um[f], "gain_um": gain_um[f],

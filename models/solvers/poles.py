@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data.arrays import Array, Mask
+from data.checks.base import THERMAL
 from features.design import Design
 from features.rises import hold_last
 from models.linear import EPS
@@ -29,7 +30,6 @@ DRIVERS = ("speed", "load", "room")  # kinds of sources that come with the drive
 _LOG_TAUS = np.log(TAUS_S)
 _PITCH = float(_LOG_TAUS[1] - _LOG_TAUS[0])
 _NODES = 6
-_THERMAL = ("temperature", "ambient")
 _LIKE_1_K = {"rpm": 1000.0, "mm/min": 1000.0}  # drivers in other units count as they are
 
 
@@ -94,7 +94,7 @@ def gaps_of(design: Design) -> list[Source]:
     """The gaps of those inputs that are plain rises of temperatures, where every batch has them."""
     room = ambient_of(design)
     channels = design.batches[0].channels if room else {}
-    names = [n for n in design.inputs if n != room and n in channels and channels[n].role in _THERMAL]
+    names = [n for n in design.inputs if n != room and n in channels and channels[n].role in THERMAL]
     found = [Source("gap", n) for n in names]
     return [s for s in found if np.isfinite(s.signal(design)).all()]
 
@@ -190,7 +190,7 @@ def _first(design: Design, name: str) -> Array:
 
 PENALTIES = np.geomspace(1e1, 1e-7, 9)
 _COARSE = (1, 4, 7, 10, 13)  # of the grid: 3 min to 8 h
-_FEW_PENALTIES = PENALTIES[2::2]  # while poles are sought
+_FEW_PATH = partial(ridge_path, penalties=PENALTIES[2::2])  # while poles are sought
 _BATCHES_PER_GAP = 2  # a gap is one number a batch
 _STEPS, _LONGEST_STEP = 8, 0.7  # in log τ
 _LOOSENESS = 0.5  # prior standard deviation of a pole's log τ about the shared one
@@ -248,18 +248,9 @@ class Search:
             if new := [f for f in sets if np.isnan(score[f])]:
                 columns = self.dictionary.places(candidate.sources(self.dictionary), candidate.poles)
                 blocks = Blocks.of(self.dictionary.table.moments.subset(columns))
-                left_um = left_out_mean_S_um(blocks, self.masks[new], False, _few_penalties_path)
+                left_um = left_out_mean_S_um(blocks, self.masks[new], False, _FEW_PATH)
                 score[new] = left_um.min(axis=1)
         return [c[int(np.argmin([self._scores[one][f] for one in c]))] for f, c in enumerate(tried)]
-
-
-def candidate_path(pool: Pool) -> Array:
-    """Ridge coefficients of a candidate's columns for all of `PENALTIES`."""
-    return ridge_path(pool.xx, pool.xy, PENALTIES)
-
-
-def _few_penalties_path(pool: Pool) -> Array:
-    return ridge_path(pool.xx, pool.xy, _FEW_PENALTIES)
 
 
 def _second_pole(c: Candidate) -> list[Candidate]:

@@ -44,16 +44,16 @@ class Pool:
 Path = Callable[[Pool], Array]  # coefficients (S, p, G) per unit of the inputs for all settings on every set of a pool
 
 
-def ridge_path(xx: Array, xy: Array, penalties: Sequence[float] | Array) -> Array:
+def ridge_path(pool: Pool, penalties: Sequence[float] | Array) -> Array:
     """Coefficients (S, p, G) that solve (XX + k trace(XX)/p) β = Xy for every penalty k."""
-    alpha = mean_diagonal(xx)
-    out = np.empty((*xy.shape, len(penalties)))
-    matrix = xx.copy()
+    alpha = mean_diagonal(pool.xx)
+    out = np.empty((*pool.xy.shape, len(penalties)))
+    matrix = pool.xx.copy()
     diagonal = np.einsum("sjj->sj", matrix)
     own = diagonal.copy()
     for g, k in enumerate(penalties):
         diagonal[:] = own + k * alpha[:, None]
-        out[:, :, g] = np.linalg.solve(matrix, xy[:, :, None])[:, :, 0]
+        out[:, :, g] = np.linalg.solve(matrix, pool.xy[:, :, None])[:, :, 0]
     return out
 
 

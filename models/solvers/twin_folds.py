@@ -344,10 +344,6 @@ class TwinRun:
         substeps = choose_substeps(network, network.values, inputs, "settled", SUBSTEPS_K)
         return cls(network, tuple(batches), used, inputs.refined(substeps))
 
-    @property
-    def n_rows(self) -> list[int]:
-        return [b.n_rows for b in self.batches]
-
     def only(self, numbers: Sequence[int]) -> TwinRun:
         """Some of the batches."""
         place = {int(k): i for i, k in enumerate(self.used)}
@@ -362,7 +358,7 @@ class TwinRun:
 
     def by_batch(self, series: Array | None) -> list[Array]:
         """A series (used batches, K) as one array (n_k,) per batch, NaN for one that cannot be simulated."""
-        out = [np.full(n, np.nan) for n in self.n_rows]
+        out = [np.full(b.n_rows, np.nan) for b in self.batches]
         for i, k in enumerate(self.used):
             assert series is not None
             out[k] = series[i, : len(out[k])]
@@ -383,7 +379,7 @@ class TwinRun:
         return errors[..., error], readings
 
     def _simulated(self, values: Array, start_K: Array) -> tuple[Array, Array]:
-        n_sets, borders = len(values), np.cumsum([0, *self.n_rows])
+        n_sets, borders = len(values), np.cumsum([0, *(b.n_rows for b in self.batches)])
         errors = np.full((n_sets, borders[-1], len(self.network.errors)), np.nan)
         readings = np.full((n_sets, borders[-1], len(self.network.readings)), np.nan)
         if self.inputs is not None:
