@@ -24,7 +24,7 @@ from models.program import Builder
 from models.protocols import forward_obstacle, in_time
 from models.solvers.batches import fold_masks
 from models.solvers.kernels import unit_scale
-from models.solvers.pooled_sums import AT_ONCE, Blocks, Path, Pool, fits, inner_sets, left_out_mean_S_um
+from models.solvers.pooled_sums import AT_ONCE, Blocks, CoefPath, Pool, fitted_paths, inner_sets, left_out_mean_S_um
 
 _ENOUGH_BATCHES, _ENOUGH_FOR_FORWARD = 3, 6
 _MOST_ROWS = 120  # of a batch that residuals are taken at: neighbours are redundant, and a fold must not cost rows
@@ -46,7 +46,7 @@ def stated_sd_um(family: Family, design: Design, batches: Sequence[int]) -> list
     return [np.sqrt(a + b * mean_square(x[design.rows(k)], design)) for k in batches]
 
 
-def left_out_spread(task: Task, square: Array, path: Path, chosen: NDArray[np.int64]) -> tuple[Array, Array]:
+def left_out_spread(task: Task, square: Array, path: CoefPath, chosen: NDArray[np.int64]) -> tuple[Array, Array]:
     """(a, b) of variance = a + b · square for every training set of a task, (F,) each; NaN below three batches.
 
     Every batch of a set is predicted by the set's own setting `chosen` (F,) of `path`, learned without that batch.
@@ -69,13 +69,13 @@ def left_out_spread(task: Task, square: Array, path: Path, chosen: NDArray[np.in
 
 
 def _left_out_um(
-    task: Task, rows: Sequence[NDArray[np.int64]], masks: Mask, path: Path, chosen: NDArray[np.int64]
+    task: Task, rows: Sequence[NDArray[np.int64]], masks: Mask, path: CoefPath, chosen: NDArray[np.int64]
 ) -> Array:
     """Residuals (F, m) at the m `rows` of all batches, each left out of its set; NaN where a set lacks the batch."""
     design, moments = task.design, task.design.moments
     outer, left, sets, which = inner_sets(masks)
     coef, constant = np.empty((len(which), len(design.inputs))), np.empty(len(which))
-    for here, at, pool, found in fits(task.blocks, sets, which, task.scaled, path):
+    for here, at, pool, found in fitted_paths(task.blocks, sets, which, task.scaled, path):
         coef[here] = found[at, :, chosen[outer[here]]]
         mean_x, mean_y = pool.mean_x[at] + moments.shift_x, pool.mean_y[at] + moments.shift_y
         constant[here] = mean_y - np.einsum("vj,vj->v", mean_x, coef[here])
@@ -139,7 +139,7 @@ class Task:
         mean_x, mean_um = pool.mean_x + moments.shift_x, pool.mean_y + moments.shift_y
         return np.asarray(mean_um - np.einsum("fj,fj->f", mean_x, coef))
 
-    def chosen(self, path: Path, order_by: str) -> NDArray[np.int64]:
+    def chosen(self, path: CoefPath, order_by: str) -> NDArray[np.int64]:
         """The setting of a path (F,) of least mean S over batches left out, from each fold's training batches.
 
         By `order_by` "leave_batch_out" each in turn; by "forward" every one from the third in time on, predicted from
@@ -285,7 +285,7 @@ class Linear(Family):
     def _solve(self, task: Task) -> tuple[Array, dict[str, NDArray[Any]]]:
         """Coefficients (F, p) per unit of the inputs, and further quantities to store, each (F,); NaN is dropped."""
 
-    def _spread(self, task: Task, path: Path, chosen: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+    def _spread(self, task: Task, path: CoefPath, chosen: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
         """Coefficients for `sd_um`, for families with `has_sd`."""
         if not self.has_sd:
             return {}

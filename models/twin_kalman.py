@@ -109,8 +109,7 @@ class TwinKalman(CorrectedTwin):
             rows = np.arange(design.offsets[k], design.offsets[k + 1], stride)
             usual_K = start_K if self.start == "usual" else 0.0
             start_degC = start_of(work.network, values, inputs, settled=True) + usual_K
-            readings = self._readings(work.network, [thin], inputs)
-            (found,) = self._filters(work.network, values, inputs, readings, start_degC, [self.fitted["heat_W"]])
+            (found,) = self._filters([thin], work.network, values, inputs, start_degC, [self.fitted["heat_W"]])
             y_um[rows] = left_um(design.y_um[rows], found.errors[0, : thin.n_rows, at])
         return y_um
 
@@ -119,34 +118,30 @@ class TwinKalman(CorrectedTwin):
         if run.inputs is None:
             return [run.by_batch(None)] * len(heat_W)
         at, values = error_of(run.network, self.target), self.values()
-        readings = self._readings(run.network, [run.batches[k] for k in run.used], run.inputs)
-        start_degC = run.start_degC(values, self._usual_K())
-        found = self._filters(run.network, values, run.inputs, readings, start_degC, heat_W)
+        batches, start_degC = [run.batches[k] for k in run.used], run.start_degC(values, self._usual_K())
+        found = self._filters(batches, run.network, values, run.inputs, start_degC, heat_W)
         return [run.by_batch(f.errors[..., at]) for f in found]
 
     def _filters(
         self,
+        batches: Sequence[Batch],
         network: Network,
         values: Array,
         inputs: Inputs,
-        readings: Array,
         start_degC: Array,
         heat_W: Sequence[float],
     ) -> list[Filtered]:
-        start_cov_K2 = np.asarray(self.fitted["start_cov_K2"], float)
-        doubts = [Doubt(start_cov_K2, self.heat_spread, watts) for watts in heat_W]
+        """By noise of the heat what the filter knows of the batches from what the selected sensors show."""
         time_s = inputs.time_s[0, :: inputs.every]
-        thin = max(1, round(self.every_s / (time_s[1] - time_s[0]))) if len(time_s) > 1 else 1
-        return filtered_each(network, values, inputs, readings, doubts, start_degC, thin)
-
-    def _readings(self, network: Network, batches: Sequence[Batch], inputs: Inputs) -> Array:
-        """What the selected sensors show at the rows (B, K, sensors), NaN for the others."""
         sensors = [r.channel for r in network.readings]
-        out = np.full((len(batches), len(inputs.time_s[0, :: inputs.every]), len(sensors)), np.nan)
+        readings = np.full((len(batches), len(time_s), len(sensors)), np.nan)
         for i, batch in enumerate(batches):
             for name in set(self.inputs) & set(sensors) & set(batch.table.columns):
-                out[i, : batch.n_rows, sensors.index(name)] = batch.masked(name)
-        return out
+                readings[i, : batch.n_rows, sensors.index(name)] = batch.masked(name)
+        start_cov_K2 = np.asarray(self.fitted["start_cov_K2"], float)
+        doubts = [Doubt(start_cov_K2, self.heat_spread, watts) for watts in heat_W]
+        thin = max(1, round(self.every_s / (time_s[1] - time_s[0]))) if len(time_s) > 1 else 1
+        return filtered_each(network, values, inputs, readings, doubts, start_degC, thin)
 
 
 def _held(design: Design) -> Design:

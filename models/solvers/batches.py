@@ -35,7 +35,7 @@ def unpadded(design: Design, values: Array) -> Array:
 
 def only(design: Design, batches: Sequence[int]) -> Design:
     """Some batches of a design, in the order given."""
-    rows = np.concatenate([np.arange(design.offsets[k], design.offsets[k + 1]) for k in batches])
+    rows = np.concatenate([np.empty(0, np.int64), *(np.arange(*design.offsets[k : k + 2]) for k in batches)])
     offsets = np.concatenate([[0], np.cumsum(np.diff(design.offsets)[list(batches)])]).astype(np.int64)
     return replace(design, batch_ids=tuple(design.batch_ids[k] for k in batches), x=design.x[rows],
                    y_um=design.y_um[rows], time_s=design.time_s[rows], offsets=offsets,

@@ -41,7 +41,9 @@ class Pool:
         return out, spread
 
 
-Path = Callable[[Pool], Array]  # coefficients (S, p, G) per unit of the inputs for all settings on every set of a pool
+CoefPath = Callable[
+    [Pool], Array
+]  # coefficients (S, p, G) per unit of the inputs for all settings on every set of a pool
 
 
 def ridge_path(pool: Pool, penalties: Sequence[float] | Array) -> Array:
@@ -136,7 +138,7 @@ class Blocks:
 
 
 def left_out_mean_S_um(
-    blocks: Blocks, masks: Mask, scaled: bool, path: Path, place: NDArray[np.int64] | None = None
+    blocks: Blocks, masks: Mask, scaled: bool, path: CoefPath, place: NDArray[np.int64] | None = None
 ) -> Array:
     """For every training set, masks (F, B), the mean S over its blocks, each left out once, by setting; (F, G) in µm.
 
@@ -145,7 +147,7 @@ def left_out_mean_S_um(
     outer, left, sets, which = inner_sets(masks, place)
     parts = [
         (some, blocks.left_out_S_um(left[some], pool, at, coef))
-        for some, at, pool, coef in fits(blocks, sets, which, scaled, path)
+        for some, at, pool, coef in fitted_paths(blocks, sets, which, scaled, path)
     ]
     S_um = np.concatenate([part for _, part in parts])[np.argsort(np.concatenate([some for some, _ in parts]))]
     border = np.searchsorted(outer, np.arange(len(masks)))
@@ -153,8 +155,8 @@ def left_out_mean_S_um(
     return np.asarray(total / np.bincount(outer, minlength=len(masks))[:, None])
 
 
-def fits(
-    blocks: Blocks, sets: Mask, which: NDArray[np.int64], scaled: bool, path: Path
+def fitted_paths(
+    blocks: Blocks, sets: Mask, which: NDArray[np.int64], scaled: bool, path: CoefPath
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], Pool, Array]]:
     """All settings on every one of the training sets (S, B), so many at a time as memory holds.
 

@@ -69,7 +69,8 @@ def test_impossible_options_are_told(key: str, options: dict[str, Any], words: s
 
 @pytest.mark.parametrize(("key", "need"), [
     ("mlr", 4), ("ridge", 4), ("pcr", 4), ("pcr_lbo", 4), ("pls", 4), ("distributed_lag", 4), ("gaussian_process", 4),
-    ("gru", 4), ("lstm", 4), ("tcn", 4), ("transfer_function", 8), ("lssvm", 2), ("svr", 2), ("bp", 2),
+    ("lag_dictionary", 4), ("gru", 4), ("lstm", 4), ("tcn", 4), ("transfer_function", 8), ("lssvm", 2), ("svr", 2),
+    ("bp", 2),
 ])  # fmt: skip
 def test_too_few_rows_are_told_in_one_line(key: str, need: int) -> None:
     design = by_hand()
@@ -80,6 +81,17 @@ def test_too_few_rows_are_told_in_one_line(key: str, need: int) -> None:
         f"family {key}: got 1 usable rows of z in b1, b2, need at least {need}; give more batches, drop inputs that "
         "are missing, or overrule a check in the machine file"
     )
+
+
+@pytest.mark.parametrize("key", ["mlr", "ridge", "pcr", "pcr_lbo", "pls", "lag_dictionary", "transfer_function"])
+def test_without_inputs_a_channel_or_a_selector_is_asked_for(key: str) -> None:
+    words = (
+        "got 0 inputs for z, expected 1 to 60; let a selector choose"
+        if key == "transfer_function"
+        else (f"^{key}: no inputs given for z; name (a|at least one) channel$")
+    )
+    with pytest.raises(InputError, match=words):
+        FAMILIES[key]().fit_folds(runs.design(False).subset(()), [[0]])
 
 
 def by_hand() -> Design:

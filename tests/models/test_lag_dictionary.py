@@ -220,11 +220,3 @@ def test_windows_are_means_and_not_too_many(runs) -> None:
     np.testing.assert_allclose(w.time_h[:2], [150 / 3600, 750 / 3600])
     many = Windows.of(design_of([run(k) for k in range(60)]), np.zeros((60 * N, 1)), range(60))
     assert 600 < len(many.y_um) <= 1260
-
-
-def test_too_few_rows_is_told_in_one_line(runs) -> None:
-    short = replace(runs[0], table=runs[0].table.iloc[:5])
-    with pytest.raises(
-        InputError, match=r"^family lag_dictionary: got 3 usable rows of z in K0, need at least 4; give"
-    ):
-        LagDictionary().fit([short], INPUTS, "z")

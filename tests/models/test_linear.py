@@ -11,7 +11,6 @@ from sklearn.model_selection import LeaveOneGroupOut
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from data.errors import InputError
 from features.design import Design
 from models.base import inner_groups
 from models.mlr import MLR
@@ -283,9 +282,3 @@ def test_pcr_counts_components_by_the_covariance_about_the_mean():
     free, zero = PCR().as_published().fit_design(design, FOLDS[0]), PCR().fit_design(design, FOLDS[0])
     assert zero.fitted["n_components"] == free.fitted["n_components"]
     assert zero.fitted["contribution"] == pytest.approx(free.fitted["contribution"], rel=0.05)
-
-
-@pytest.mark.parametrize("cls", LINEAR)
-def test_without_inputs_it_asks_for_one(cls):
-    with pytest.raises(InputError, match="no inputs given for z_um; name at least one channel"):
-        cls().as_published().fit_design(make_design().subset(()), [0])

@@ -8,7 +8,6 @@ import pytest
 from scipy.signal import cont2discrete, lti
 
 from data.batch import Batch, Channel
-from data.errors import InputError
 from features.design import Design
 from models.metrics import residual_std_um
 from models.ridge import Ridge
@@ -190,9 +189,3 @@ def test_some_batches_of_a_design_are_those_batches():
     assert some.batch_ids == ("b3", "b1")
     np.testing.assert_array_equal(some.x[some.rows(1)], design.x[design.rows(1)])
     np.testing.assert_array_equal(some.drivers[some.rows(0)], design.drivers[design.rows(3)])
-
-
-def test_without_inputs_a_selector_is_asked_for():
-    design = make(cascade, batches=2)
-    with pytest.raises(InputError, match=r"got 0 inputs for z, expected 1 to 60; let a selector choose"):
-        TransferFunction().fit_design(design.subset(()), [0, 1])
