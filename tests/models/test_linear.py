@@ -13,6 +13,8 @@ from sklearn.preprocessing import StandardScaler
 
 from features.design import Design
 from models.base import inner_groups
+from models.elastic_net import ElasticNet
+from models.huber import Huber
 from models.mlr import MLR
 from models.pcr import PCR, PCRByLeaveBatchOut
 from models.pls import PLS
@@ -20,6 +22,7 @@ from models.ridge import Ridge
 from thermodrift.testing.runs import stack
 
 LINEAR = [MLR, Ridge, PCR, PCRByLeaveBatchOut, PLS]
+EVERY = [*LINEAR, ElasticNet, Huber]
 K, N, P = 8, 60, 6
 FOLDS = [[j for j in range(K) if j != k] for k in range(K)] + [[k] for k in range(K)] + [[0, 3], [1, 2, 5]]
 
@@ -207,7 +210,7 @@ def test_a_driver_in_rpm_among_the_inputs_makes_ridge_scale_by_the_training_std(
         X, y, _ = design.stacked(fold)
         same = make_pipeline(StandardScaler(), SkRidge(alpha=model.fitted["alpha"], solver="svd")).fit(X, y)
         near(predicted(model, design), same.predict(design.x))
-    for cls in LINEAR:  # rev/s instead of rpm is the same machine
+    for cls in EVERY:  # rev/s instead of rpm is the same machine
         other = make_design(x=x / [1, 1, 1, 1, 1, 60], units=("K",) * 5 + ("Hz",))
         near(published(cls, other, FOLDS[0]), published(cls, design, FOLDS[0]))
 
@@ -220,7 +223,7 @@ def test_a_shifted_or_stretched_error_gives_a_shifted_or_stretched_prediction(cl
     near(published(cls, make_design(1, y_um=design.y_um * -3), FOLDS[2]), base * -3)
 
 
-@pytest.mark.parametrize("cls", LINEAR)
+@pytest.mark.parametrize("cls", EVERY)
 def test_a_subset_of_the_design_is_a_design_of_its_own(cls):
     design = make_design(4)
     sub, own = design.subset(("t4", "t1")), make_design(4, x=design.x[:, [4, 1]])
@@ -228,7 +231,7 @@ def test_a_subset_of_the_design_is_a_design_of_its_own(cls):
         near(published(cls, sub, fold), published(cls, own, fold))
 
 
-@pytest.mark.parametrize("cls", LINEAR)
+@pytest.mark.parametrize("cls", EVERY)
 def test_rows_with_a_hole_are_left_out_of_the_fit_and_stay_holes_in_the_prediction(cls):
     design = make_design(5)
     x, y_um = design.x.copy(), design.y_um.copy()
@@ -259,7 +262,7 @@ def test_chunked_and_whole_choice_agree(monkeypatch):
         near(one.fitted["coef_um_per_K"], other.fitted["coef_um_per_K"])
 
 
-@pytest.mark.parametrize("cls", LINEAR)
+@pytest.mark.parametrize("cls", EVERY)
 def test_by_default_the_fit_has_no_intercept_and_its_inputs_begin_at_zero(cls):
     """Absolute temperatures: what counts is the rise since the start, in the fit and in the prediction."""
     design = make_design(5)
