@@ -21,12 +21,12 @@ from models.solvers.poles import (
     TAUS_S,
     Candidate,
     Dictionary,
-    Search,
     Source,
     combination,
     drivers_of,
     gaps_of,
     refined,
+    searched,
 )
 from models.solvers.pooled_sums import Blocks, ridge_path
 
@@ -88,7 +88,7 @@ class TransferFunction(Family):
         dictionary = Dictionary(design, sources, about_start=self.zero_start)
         best, many = [Candidate()] * len(masks), np.flatnonzero(masks.sum(axis=1) >= _ENOUGH_BATCHES)
         if len(many):
-            for f, candidate in zip(many, Search(dictionary, masks[many]).run(self.poles), strict=True):
+            for f, candidate in zip(many, searched(dictionary, masks[many], self.poles), strict=True):
                 best[f] = candidate
         out: dict[int, Self] = {}
         for candidate in dict.fromkeys(best):

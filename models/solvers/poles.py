@@ -214,43 +214,33 @@ class Candidate:
         ]
 
 
-class Search:
+def searched(dictionary: Dictionary, masks: Mask, n_poles: int) -> list[Candidate]:
     """The best candidate of every training set, masks (F, K)."""
+    scores: dict[Candidate, Array] = {}
 
-    def __init__(self, dictionary: Dictionary, masks: Mask) -> None:
-        self.dictionary, self.masks = dictionary, masks
-        self._scores: dict[Candidate, Array] = {}
-
-    def run(self, n_poles: int) -> list[Candidate]:
-        """A candidate per set."""
-        exponents = tuple(dict.fromkeys(s.exponent for s in self.dictionary.sources if s.kind in DRIVERS))
-        least = _BATCHES_PER_GAP * sum(s.kind == "gap" for s in self.dictionary.sources)
-        start = Candidate((), exponents[0] if exponents else 0.0)
-        best = [replace(start, gaps=0 < least <= n) for n in self.masks.sum(axis=1)]
-        if n_poles > 0:
-            best = self._better(best, lambda c: [c, *(replace(c, poles=(a,)) for a in _COARSE)])
-        if n_poles > 1:
-            best = self._better(best, _second_pole)
-        best = self._better(best, lambda c: [c, replace(c, gaps=False)])
-        if exponents:
-            best = self._better(best, lambda c: [c, *(replace(c, exponent=m) for m in (0.0, *exponents))])
-        return best
-
-    def _better(self, best: Sequence[Candidate], others: Callable[[Candidate], list[Candidate]]) -> list[Candidate]:
+    def better(best: Sequence[Candidate], others: Callable[[Candidate], list[Candidate]]) -> list[Candidate]:
         """The alternative of least score for every set, next to its best; equal scores keep the first."""
         tried = [list(dict.fromkeys(others(candidate))) for candidate in best]
-        sets_of: dict[Candidate, list[int]] = {}
-        for f, candidates in enumerate(tried):
-            for candidate in candidates:
-                sets_of.setdefault(candidate, []).append(f)
-        for candidate, sets in sets_of.items():
-            score = self._scores.setdefault(candidate, np.full(len(best), np.nan))
-            if new := [f for f in sets if np.isnan(score[f])]:
-                columns = self.dictionary.places(candidate.sources(self.dictionary), candidate.poles)
-                blocks = Blocks.of(self.dictionary.table.moments.subset(columns))
-                left_um = left_out_mean_S_um(blocks, self.masks[new], False, _FEW_PATH)
-                score[new] = left_um.min(axis=1)
-        return [c[int(np.argmin([self._scores[one][f] for one in c]))] for f, c in enumerate(tried)]
+        for candidate in dict.fromkeys(one for candidates in tried for one in candidates):
+            score = scores.setdefault(candidate, np.full(len(best), np.nan))
+            if new := [f for f, candidates in enumerate(tried) if candidate in candidates and np.isnan(score[f])]:
+                columns = dictionary.places(candidate.sources(dictionary), candidate.poles)
+                blocks = Blocks.of(dictionary.table.moments.subset(columns))
+                score[new] = left_out_mean_S_um(blocks, masks[new], False, _FEW_PATH).min(axis=1)
+        return [c[int(np.argmin([scores[one][f] for one in c]))] for f, c in enumerate(tried)]
+
+    exponents = tuple(dict.fromkeys(s.exponent for s in dictionary.sources if s.kind in DRIVERS))
+    least = _BATCHES_PER_GAP * sum(s.kind == "gap" for s in dictionary.sources)
+    start = Candidate((), exponents[0] if exponents else 0.0)
+    best = [replace(start, gaps=0 < least <= n) for n in masks.sum(axis=1)]
+    if n_poles > 0:
+        best = better(best, lambda c: [c, *(replace(c, poles=(a,)) for a in _COARSE)])
+    if n_poles > 1:
+        best = better(best, _second_pole)
+    best = better(best, lambda c: [c, replace(c, gaps=False)])
+    if exponents:
+        best = better(best, lambda c: [c, *(replace(c, exponent=m) for m in (0.0, *exponents))])
+    return best
 
 
 def _second_pole(c: Candidate) -> list[Candidate]:
