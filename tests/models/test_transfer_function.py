@@ -13,8 +13,7 @@ from models.metrics import residual_std_um
 from models.ridge import Ridge
 from models.solvers.batches import only
 from models.solvers.lags import lag_responses
-from models.solvers.poles import TAUS_S, Dictionary, Source, combination
-from models.transfer_function import TransferFunction
+from models.transfer_function import TAUS_S, Dictionary, Source, TransferFunction, combination
 
 STEP_S = 120.0
 CHANNELS = {
