@@ -80,11 +80,11 @@ class Columns:
     each: tuple[Column, ...]
     largest: Array  # (K, r) largest size of each raw signal in each batch
 
-    @property
-    def names(self) -> list[str]:
-        return [c.name for c in self.each]
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        return tuple(c.name for c in self.each)
 
-    @property
+    @cached_property
     def reach(self) -> NDArray[np.int64]:
         return np.array([c.reach for c in self.each], np.int64)
 
@@ -219,10 +219,10 @@ _USUAL_SETTING = _Setting(10.0, DRIVEN, 1.0)
 class LagDictionary(Family):
     """error_um = x(t) · β over a dictionary of delayed inputs, drivers and start states, β by pooling batches.
 
-    Columns (`Columns`): each input as it is and behind lags of 10 min to 8 h, each driver
-    (a speed also squared) likewise, how the machine stood at the start, and the clock. A batch's error is x · β and a
-    drift of its own that no column explains, so that the fit is generalised least squares with a ridge prior
-    (`models.solvers.batch_process`). The prediction is 0 at the first row.
+    Columns: each input as it is and behind lags of 10 min to 8 h, each driver (a speed also squared) likewise, how the
+    machine stood at the start, and the clock. A batch's error is x · β and a drift of its own that no column explains,
+    so that the fit is generalised least squares with a ridge prior (`models.solvers.batch_process`). The prediction is
+    0 at the first row.
 
     Eighteen settings (three levels of the prior; inputs of now, or also slow ones and the start, or also drivers; a
     drift that wanders or mostly stands) are averaged with weights S^−10, S the mean residual standard deviation of
@@ -272,7 +272,7 @@ class LagDictionary(Family):
                 learned.append(_Pooling(columns, windows.only(fold)).learn(None))
         return [
             self._learned(design, {
-                "columns": columns.names, **pooled,
+                "columns": list(columns.names), **pooled,
                 "mistrusted": [design.batch_ids[k] for k in pooled["mistrusted"]],
                 "n_rows": int(design.usable[np.isin(design.group, list(fold))].sum()),
             })

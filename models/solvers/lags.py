@@ -28,12 +28,11 @@ def behind(laid: Array, tau_s: float, step_s: Array, before: Array | float = 0.0
 
     if tau_s == 0:
         return laid
-    driven = laid - before
-    driven[:, :1] = 0.0
-    out = np.zeros_like(driven)
+    out = laid - before
+    out[:, :1] = 0.0
     for step, which in _by_step(step_s):
         keep = float(np.exp(-step / tau_s))
-        out[which] = lfilter([1.0 - keep], [1.0, -keep], driven[which], axis=1)
+        out[which] = lfilter([1.0 - keep], [1.0, -keep], out[which], axis=1)
     out += before
     return out
 
