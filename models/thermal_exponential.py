@@ -199,7 +199,7 @@ def _lag_slope(load: Array, tau_s: float, step_s: Array, lag: Array) -> Array:
     """d lag / d log τ, (K, n), from the recursion's own derivative."""
     ratio = step_s / tau_s
     driven = np.zeros_like(load)
-    driven[:, 1:] = (ratio / np.expm1(ratio))[:, None] * (lag[:, :-1] - load[:, 1:])
+    driven[:, 1:] = (ratio * np.exp(-ratio) / -np.expm1(-ratio))[:, None] * (lag[:, :-1] - load[:, 1:])
     return behind(driven, tau_s, step_s)
 
 

@@ -40,10 +40,10 @@ def behind(laid: Array, tau_s: float, step_s: Array, before: Array | float = 0.0
 def lag_responses(
     design: Design, x: Array, responses: Sequence[Response], at_rest: bool | NDArray[np.bool_] = True
 ) -> Array:
-    """Every response of every column of x (n, p), (n, m, p); NaN where a batch has nothing of a column.
+    """Every response of every column of x (n, p) without holes, (n, m, p).
 
     Before a batch a column `at_rest` (p,) is 0, another one has its first value. A delay that is no multiple of the
-    batch's step is interpolated.
+    batch's step is interpolated. A column that is NaN throughout a batch stays so, up to what it was before.
     """
     laid, step_s = padded(design, x), steps_s(design)
     before = np.where(at_rest, 0.0, laid[:, :1])
