@@ -1,25 +1,24 @@
 """The thermal exponential against closed forms, and what a stop does."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from features.design import Design
 from models.solvers.lags import behind
 from models.thermal_exponential import ThermalExponential
+from thermodrift.testing.runs import stack
 
 
-def make_design(speeds, y, step_s=300.0, unit="rpm") -> Design:
+def make_design(speeds, y) -> Design:
     """One batch per series; `speeds` None makes a design without drivers."""
     sizes = [len(v) for v in y]
-    offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    time_s = np.concatenate([np.arange(n) * step_s for n in sizes])
-    driver = {}
-    if speeds is not None:
-        driver = {"drivers": np.concatenate(speeds)[:, None].astype(float), "driver_names": ("spindle",),
-                  "driver_units": (unit,)}  # fmt: skip
-    ids = tuple(f"K{k + 1}" for k in range(len(sizes)))
-    rows = int(offsets[-1])
-    return Design((), "z", ids, np.empty((rows, 0)), np.concatenate(y), time_s, offsets, step_s, **driver)
+    design = stack(np.empty((sum(sizes), 0)), np.concatenate(y), sizes)
+    if speeds is None:
+        return design
+    drivers = np.concatenate(speeds)[:, None].astype(float)
+    return replace(design, drivers=drivers, driver_names=("spindle",), driver_units=("rpm",))
 
 
 T = np.arange(100) * 300.0
@@ -90,8 +89,7 @@ def test_missing_errors_do_not_count_and_inputs_do_not_matter():
     errors = [rise(30.0, 3000.0), rise(30.0, 3000.0)]
     errors[1][10:40] = np.nan
     design = make_design(None, errors)
-    broken = Design(("t",), "z", design.batch_ids, np.full((200, 1), np.nan), design.y_um, design.time_s,
-                    design.offsets, 300.0)  # fmt: skip
+    broken = replace(design, inputs=("t",), x=np.full((200, 1), np.nan))
     model = ThermalExponential().fit_design(broken, [0, 1])
     assert model.fitted["tau_s"][0] == pytest.approx(3000.0, rel=1e-3)
 
