@@ -43,10 +43,10 @@ def lag_responses(
     """Every response of every column of x (n, p) without holes, (n, m, p).
 
     Before a batch a column `at_rest` (p,) is 0, another one has its first value. A delay that is no multiple of the
-    batch's step is interpolated. A column that is NaN throughout a batch stays so, up to what it was before.
+    batch's step is interpolated. A column that is NaN throughout a batch stays so.
     """
     laid, step_s = padded(design, x), steps_s(design)
-    before = np.where(at_rest, 0.0, laid[:, :1])
+    before = laid[:, :1] * np.logical_not(at_rest)  # NaN stays NaN
     out = np.empty((len(x), len(responses), x.shape[1]))
     for i, (delay_s, tau_s) in enumerate(responses):
         out[:, i] = unpadded(design, _delayed(behind(laid, tau_s, step_s, before), delay_s, step_s, before))
