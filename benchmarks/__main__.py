@@ -31,8 +31,8 @@ from data.batch import Batch
 from features.design import Design
 from features.rises import temperature_inputs
 from models.crossing import Plan
+from models.lag_dictionary import DRIVEN, Columns
 from models.solvers.batch_process import ByColumns, ByRows, Windows
-from models.solvers.lags import DRIVEN, Columns
 
 
 @dataclass(frozen=True)

@@ -31,13 +31,12 @@ from features.design import Design
 from models import lag_dictionary
 from models.base import Family
 from models.distributed_lag import DistributedLag
-from models.lag_dictionary import LagDictionary
+from models.lag_dictionary import PROMPT, UNDRIVEN, Columns, LagDictionary
 from models.metrics import residual_std_um
 from models.mlr import MLR
 from models.protocols import Fold
 from models.ridge import Ridge
 from models.solvers.batch_process import BatchProcess, Windows
-from models.solvers.lags import PROMPT, UNDRIVEN, Columns
 
 FAMILIES: dict[str, Family] = {
     "mlr": MLR(),

@@ -3,33 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data.arrays import Array
 from data.errors import InputError, closest
 from features.design import Design
 from models.base import Family
-from models.linear import Blocks, Task
+from models.linear import Pool, Task
 from models.program import Builder
-from models.solvers.batches import by_batch, fold_masks, steps_s
+from models.solvers.batches import bridged, by_batch, fold_masks, steps_s
 from models.solvers.kernels import unit_scale
-from models.solvers.lags import (
-    CRITERIA,
-    LagRegression,
-    Response,
-    Shape,
-    effective_rows,
-    free_shapes,
-    intercepts_um,
-    koyck_shapes,
-    lag_responses,
-    polynomial_shapes,
-)
+from models.solvers.lags import Response, lag_responses, with_columns
+from models.solvers.pooled_sums import mean_diagonal, ridge_path
 
 LAGS = ("koyck", "almon", "free")
+CRITERIA = ("forward", "leave_batch_out", "aic", "bic")
 KOYCK_TAUS_S = tuple(60.0 * t for t in (10, 20, 40, 80, 160, 320, 640))
+RIDGES = (1e-2, 1e-4, 1e-6, 1e-8)  # of the mean variance of the columns, strongest first
+_ORDERS = (0, 1, 2, 3, 4, 6, 9, 12, 18, 24, 36, 48)
 _LEAST_ROWS = 4
 
 
@@ -46,7 +42,7 @@ class DistributedLag(Family):
     Lags are `lag_min` minutes apart (at least a step), whatever the sampling step, q at most `max_lags`. Before a batch
     starts inputs have their first value (0 for a rise), drivers rest. A ridge penalty, k times the mean variance
     of the columns, keeps lags of collinear sensors apart. Order or decay, and k, are chosen by `order_by`: `forward`
-    or `leave_batch_out` inside the training batches (`models.linear.Tuned`), `aic` or `bic`. Residuals of a thermal
+    or `leave_batch_out` inside the training batches (`models.linear.Task`), `aic` or `bic`. Residuals of a thermal
     run are autocorrelated: the criteria count `effective_rows`, n (1 − ρ)/(1 + ρ) with ρ their lag-one autocorrelation.
 
     Source: S. Almon, Econometrica 33 (1965); L. Koyck, Distributed lags and investment analysis (1954);
@@ -88,25 +84,28 @@ class DistributedLag(Family):
         if not folds:
             return []
         responses, shapes = self._tried(design)
-        columns = self.started(_columns(design, responses))
-        moments = columns.moments
-        count = moments.count if design.inputs else np.zeros(design.n_batches)
-        masks = fold_masks(self.key, design, folds, count, _LEAST_ROWS)
-        blocks = Blocks.of(moments)
-        task = Task(columns, masks, blocks, blocks.pool(masks, False), False)
-        coef, learned = LagRegression(shapes, self.order_by).solve(task)
+        x = _responses(design, responses) / unit_scale(design)
+        columns = self.started(with_columns(design, x.reshape(len(x), -1)))
+        count = columns.moments.count if design.inputs else np.zeros(design.n_batches)
+        task = Task.of(columns, fold_masks(self.key, design, folds, count, _LEAST_ROWS), False)
+        path = partial(shaped_path, shapes)
+        if self.order_by in ("aic", "bic"):
+            chosen = np.argmin(criterion(task, shapes, self.order_by), axis=1)
+        else:
+            chosen = task.chosen(path, self.order_by)
+        coef = np.take_along_axis(path(task.pool), chosen[:, None, None], axis=2)[:, :, 0]
         rho, rows = effective_rows(task, coef)
-        intercept_um = intercepts_um(task, coef)
+        intercept_um = task.intercept_um(coef)
         weights = coef.reshape(len(folds), len(responses), -1) / unit_scale(design)
         out = []
         for f in range(len(folds)):
-            used = list(shapes[learned["shape"][f]].responses)
+            used = np.flatnonzero(shapes[chosen[f] // len(RIDGES)].any(axis=1))
             fitted = {
                 "weights_um_per_K": weights[f, used],
                 "delays_s": np.array([responses[i][0] for i in used]),
                 "taus_s": np.array([responses[i][1] for i in used]),
                 "intercept_um": float(intercept_um[f]),
-                "k": float(learned["k"][f]),
+                "k": RIDGES[chosen[f] % len(RIDGES)],
                 "n_rows": int(task.pool.count[f]),
                 "residual_autocorrelation": float(rho[f]),
                 "effective_rows": float(rows[f]),
@@ -123,7 +122,7 @@ class DistributedLag(Family):
         weights = np.zeros((len(fitted), len(place), len(design.inputs)))
         for f, some in enumerate(own):
             weights[f, [place[r] for r in some]] = fitted[f].fitted["weights_um_per_K"]
-        x = lag_responses(design, list(place)).reshape(len(design.time_s), -1)
+        x = _responses(design, list(place)).reshape(len(design.time_s), -1)
         predicted = x @ weights.reshape(len(fitted), -1).T + np.array([m.fitted["intercept_um"] for m in fitted])
         return by_batch(design, predicted, wanted)
 
@@ -139,20 +138,91 @@ class DistributedLag(Family):
         """Coefficients, the order or decay, and the intercept where the level is free."""
         return int(self.fitted["weights_um_per_K"].size) + 1 + (not self.zero_start)
 
-    def _tried(self, design: Design) -> tuple[list[Response], list[Shape]]:
+    def _tried(self, design: Design) -> tuple[list[Response], list[Array]]:
+        """Responses of every input, and the shapes that their coefficients may have."""
         if self.lags == "koyck":
             return [(0.0, 0.0), *((0.0, tau_s) for tau_s in KOYCK_TAUS_S)], koyck_shapes(len(KOYCK_TAUS_S))
         spacing_s = float(np.nanmax([60.0 * self.lag_min, *steps_s(design)]))
-        responses = [(spacing_s * lag, 0.0) for lag in range(self.max_lags + 1)]
-        if self.lags == "free":
-            return responses, free_shapes(self.max_lags)
-        return responses, polynomial_shapes(self.max_lags, self.degree)
+        degree = self.max_lags if self.lags == "free" else self.degree
+        return [(spacing_s * lag, 0.0) for lag in range(self.max_lags + 1)], lag_shapes(self.max_lags, degree)
 
 
-def _columns(design: Design, responses: Sequence[Response]) -> Design:
-    """The responses of all inputs, in their scale, as the inputs of a design of the same batches."""
-    x = lag_responses(design, responses) / unit_scale(design)
-    names = tuple(f"{name}@{delay_s:g}s+{tau_s:g}s" for delay_s, tau_s in responses for name in design.inputs)
-    y_um = np.where(design.usable, design.y_um, np.nan)
-    return Design(names, design.target, design.batch_ids, x.reshape(len(x), -1), y_um, design.time_s, design.offsets,
-                  design.step_s, batches=design.batches)  # fmt: skip
+def _responses(design: Design, responses: Sequence[Response]) -> Array:
+    """Responses (n, m, p) of all inputs, whose holes are bridged; drivers rest before a batch."""
+    at_rest = np.array([name.partition("@")[0] in design.driver_names for name in design.inputs], bool)
+    return lag_responses(design, bridged(design, design.x), responses, at_rest)
+
+
+def lag_shapes(max_lags: int, degree: int) -> list[Array]:
+    """Lags 0 … q, for orders q up to `max_lags`, on polynomials of a degree as orthonormal columns (Almon 1965).
+
+    A shape (m, d) times d free coefficients of an input gives those of its m responses. Orders up to the degree are
+    free.
+    """
+    shapes = []
+    for q in sorted({q for q in _ORDERS if q < max_lags} | {max_lags}):
+        powers = np.vander(np.linspace(-1.0, 1.0, q + 1), degree + 1, increasing=True)
+        mix = np.eye(q + 1) if q <= degree else np.linalg.qr(powers)[0]
+        shapes.append(np.pad(mix, [(0, max_lags - q), (0, 0)]))
+    return shapes
+
+
+def koyck_shapes(n_decays: int) -> list[Array]:
+    """The input alone, or with one of `n_decays` geometric tails, which stand behind it (Koyck 1954)."""
+    each = np.eye(n_decays + 1)
+    return [each[:, :1], *(each[:, [0, j]] for j in range(1, n_decays + 1))]
+
+
+def shaped_path(shapes: Sequence[Array], pool: Pool) -> Array:
+    """Coefficients (S, m p, G) of all responses for every shape with each of `RIDGES`; columns response by response."""
+    path = np.zeros((*pool.xy.shape, len(shapes) * len(RIDGES)))
+    for s, shape in enumerate(shapes):
+        at, mix, free = _free(shape, pool)
+        coef = ridge_path(free, RIDGES)
+        path[:, at, s * len(RIDGES) : (s + 1) * len(RIDGES)] = coef if mix is None else mix @ coef
+    return path
+
+
+def _free(shape: Array, pool: Pool) -> tuple[NDArray[np.int64], Array | None, Pool]:
+    """Columns of a shape, how they mix the free coefficients (None: not at all), and the sums of these."""
+    used = np.flatnonzero(shape.any(axis=1))
+    p = pool.xy.shape[1] // len(shape)
+    at: NDArray[np.int64] = (used[:, None] * p + np.arange(p)).ravel()
+    xx, xy = pool.xx[:, at[:, None], at], pool.xy[:, at]
+    if len(used) == shape.shape[1]:
+        return at, None, replace(pool, xx=xx, xy=xy)
+    mix: Array = np.kron(shape[used], np.eye(p)).astype(float)
+    return at, mix, replace(pool, xx=mix.T @ xx @ mix, xy=xy @ mix)
+
+
+def criterion(task: Task, shapes: Sequence[Array], order_by: str) -> Array:
+    """AIC or BIC (F, G), counting effective rows as the longest lags with the weakest penalty leave them."""
+    pool, blocks = task.pool, task.blocks
+    path = shaped_path(shapes, pool)
+    parameters = []
+    for xx in (_free(shape, pool)[2].xx for shape in shapes):
+        values, ridge = np.linalg.eigvalsh(xx)[:, :, None], mean_diagonal(xx)[:, None, None] * RIDGES
+        parameters.append(1.0 + (values / (values + ridge)).sum(axis=1))
+    fold, block = np.nonzero(task.masks)
+    S_um = blocks.left_out_S_um(block, pool, fold, path)
+    sse = np.zeros((len(task.masks), path.shape[2]))
+    np.add.at(sse, fold, S_um**2 * np.maximum(blocks.count[block] - 1.0, 1.0)[:, None])
+    rows = effective_rows(task, path[:, :, -1])[1]
+    weight = 2.0 if order_by == "aic" else np.log(rows)[:, None]
+    fit = np.log(np.maximum(sse, np.finfo(float).tiny) / pool.count[:, None])
+    return np.asarray(rows[:, None] * fit + weight * np.hstack(parameters))
+
+
+def effective_rows(task: Task, coef: Array) -> tuple[Array, Array]:
+    """Lag-one autocorrelation ρ of each fold's residuals inside its batches, and n (1 − ρ)/(1 + ρ); (F,) each.
+
+    Source: M. Bartlett, Some aspects of the time-correlation problem, J. R. Stat. Soc. 98 (1935).
+    """
+    design, usable = task.design, task.design.usable
+    residual = np.where(usable[:, None], design.y_um[:, None] - design.x @ coef.T - task.intercept_um(coef), 0.0)
+    residual *= task.masks.T[design.group]
+    together = (design.group[1:] == design.group[:-1])[:, None]
+    power = np.einsum("nf,nf->f", residual, residual)
+    product = np.einsum("nf,nf->f", residual[1:] * together, residual[:-1])
+    rho = np.clip(np.divide(product, power, out=np.zeros_like(power), where=power > 0), 0.0, 1.0)
+    return rho, np.maximum(task.pool.count * (1.0 - rho) / (1.0 + rho), 2.0)

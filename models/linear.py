@@ -7,7 +7,7 @@ matrices, and a choice by leave-batch-out inside them 435 more (leaving out i an
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
@@ -24,10 +24,10 @@ from models.program import Builder
 from models.protocols import forward_obstacle, in_time
 from models.solvers.batches import fold_masks
 from models.solvers.kernels import unit_scale
-from models.solvers.pooled_sums import AT_ONCE, Blocks, Pool, inner_sets, left_out_mean_S_um
+from models.solvers.pooled_sums import AT_ONCE, Blocks, CoefPath, Pool, fitted_paths, inner_sets, left_out_mean_S_um
 
 _ENOUGH_BATCHES, _ENOUGH_FOR_FORWARD = 3, 6
-_MOST_ROWS = 120  # of a batch that residuals are taken at
+_MOST_ROWS = 120  # of a batch that residuals are taken at: neighbours are redundant, and a fold must not cost rows
 _LEAST_SHARE = 0.01  # of the mean square residual, that a keeps: no recorded value is free of noise
 
 
@@ -46,10 +46,8 @@ def stated_sd_um(family: Family, design: Design, batches: Sequence[int]) -> list
     return [np.sqrt(a + b * mean_square(x[design.rows(k)], design)) for k in batches]
 
 
-def left_out_spread(
-    design: Design, square: Array, masks: Mask, scaled: bool, path: Callable[[Pool], Array], chosen: NDArray[np.int64]
-) -> tuple[Array, Array]:
-    """(a, b) of variance = a + b · square for every training set, masks (F, K); NaN below three batches.
+def left_out_spread(task: Task, square: Array, path: CoefPath, chosen: NDArray[np.int64]) -> tuple[Array, Array]:
+    """(a, b) of variance = a + b · square for every training set of a task, (F,) each; NaN below three batches.
 
     Every batch of a set is predicted by the set's own setting `chosen` (F,) of `path`, learned without that batch.
     a > 0 and b ≥ 0 are least squares of the squared residuals, then made larger until nine tenths of them lie inside
@@ -59,40 +57,26 @@ def left_out_spread(
     Args:
         square: what the variance grows with, on every row of the design, (n,).
     """
+    design, masks = task.design, task.masks
     a, b = np.full(len(masks), np.nan), np.full(len(masks), np.nan)
     many = np.flatnonzero(masks.sum(axis=1) >= _ENOUGH_BATCHES)
     if len(many):
-        rows = _judged_rows(design)
-        error = _left_out_um(design, rows, masks[many], scaled, path, chosen[many])
+        every = [np.flatnonzero(design.usable[design.rows(k)]) + design.offsets[k] for k in range(design.n_batches)]
+        rows = [own[:: -(-len(own) // _MOST_ROWS) or 1] for own in every]
+        error = _left_out_um(task, rows, masks[many], path, chosen[many])
         a[many], b[many] = _fitted(error**2, square[np.concatenate(rows)])
     return a, b
 
 
-def _judged_rows(design: Design) -> list[NDArray[np.int64]]:
-    """Usable rows of every batch, at most 120 each: neighbours are redundant, and a fold must not cost rows."""
-    every = [np.flatnonzero(design.usable[design.rows(k)]) + design.offsets[k] for k in range(design.n_batches)]
-    return [rows[:: -(-len(rows) // _MOST_ROWS) or 1] for rows in every]
-
-
 def _left_out_um(
-    design: Design,
-    rows: Sequence[NDArray[np.int64]],
-    masks: Mask,
-    scaled: bool,
-    path: Callable[[Pool], Array],
-    chosen: NDArray[np.int64],
+    task: Task, rows: Sequence[NDArray[np.int64]], masks: Mask, path: CoefPath, chosen: NDArray[np.int64]
 ) -> Array:
     """Residuals (F, m) at the m `rows` of all batches, each left out of its set; NaN where a set lacks the batch."""
-    moments = design.moments
-    blocks = Blocks.of(moments)
+    design, moments = task.design, task.design.moments
     outer, left, sets, which = inner_sets(masks)
     coef, constant = np.empty((len(which), len(design.inputs))), np.empty(len(which))
-    step = max(1, AT_ONCE // len(design.inputs) ** 2)
-    for start in range(0, len(sets), step):
-        pool = blocks.pool(sets[start : start + step], scaled)
-        here = np.flatnonzero((which >= start) & (which < start + step))
-        at = which[here] - start
-        coef[here] = path(pool)[at, :, chosen[outer[here]]]
+    for here, at, pool, found in fitted_paths(task.blocks, sets, which, task.scaled, path):
+        coef[here] = found[at, :, chosen[outer[here]]]
         mean_x, mean_y = pool.mean_x[at] + moments.shift_x, pool.mean_y[at] + moments.shift_y
         constant[here] = mean_y - np.einsum("vj,vj->v", mean_x, coef[here])
     order = np.argsort(left, kind="stable")
@@ -143,6 +127,39 @@ class Task:
     blocks: Blocks
     pool: Pool
     scaled: bool
+
+    @classmethod
+    def of(cls, design: Design, masks: Mask, scaled: bool) -> Self:
+        blocks = Blocks.of(design.moments)
+        return cls(design, masks, blocks, blocks.pool(masks, scaled), scaled)
+
+    def intercept_um(self, coef: Array) -> Array:
+        """Intercepts (F,) of coefficients (F, p) fitted about the means."""
+        moments, pool = self.design.moments, self.pool
+        mean_x, mean_um = pool.mean_x + moments.shift_x, pool.mean_y + moments.shift_y
+        return np.asarray(mean_um - np.einsum("fj,fj->f", mean_x, coef))
+
+    def chosen(self, path: CoefPath, order_by: str) -> NDArray[np.int64]:
+        """The setting of a path (F,) of least mean S over batches left out, from each fold's training batches.
+
+        By `order_by` "leave_batch_out" each in turn; by "forward" every one from the third in time on, predicted from
+        those before it. Fewer than 6 batches, or undated ones, are left out in turn; of fewer than 3 contiguous
+        quarters (`models.base.inner_groups`).
+        """
+        chosen, n = np.zeros(len(self.masks), np.int64), self.masks.sum(axis=1)
+        known = self.design.batches  # of a design made by hand batches are in order as they come
+        place = np.argsort(in_time(known)) if known else np.arange(self.design.n_batches)
+        forward = order_by == "forward" and not (known and forward_obstacle(known))
+        ahead, few = forward & (n >= _ENOUGH_FOR_FORWARD), n < _ENOUGH_BATCHES
+        for some, order in ((ahead, place), (~ahead & ~few, None)):
+            if some.any():
+                S_um = left_out_mean_S_um(self.blocks, self.masks[some], self.scaled, path, order)
+                chosen[some] = np.argmin(S_um, axis=1)
+        if few.any():
+            quarters = Blocks.of(self.design.quarters)
+            masks = np.repeat(self.masks[few], 4, axis=1) & (quarters.count > 0)
+            chosen[few] = np.argmin(left_out_mean_S_um(quarters, masks, self.scaled, path), axis=1)
+        return chosen
 
     @cached_property
     def _factors(self) -> list[tuple[Array, Array, float]]:
@@ -205,16 +222,13 @@ class Linear(Family):
             target = design.target or "the error"
             raise InputError(f"{self.key}: no inputs given for {target}; name at least one channel")
         design = self.started(design)
-        moments = design.moments
-        masks = fold_masks(self.key, design, folds, moments.count, _MIN_ROWS)
-        scaled = any(unit not in _KELVIN for unit in design.input_units)
-        blocks = Blocks.of(moments)
-        task = Task(design, masks, blocks, blocks.pool(masks, scaled), scaled)
+        masks = fold_masks(self.key, design, folds, design.moments.count, _MIN_ROWS)
+        task = Task.of(design, masks, any(unit not in _KELVIN for unit in design.input_units))
         coef, learned = self._solve(task)
         pool = task.pool
         coef = np.where(np.einsum("fjj->fj", pool.xx) > 0, coef, 0.0)
-        intercept = pool.mean_y + moments.shift_y - np.einsum("fj,fj->f", pool.mean_x + moments.shift_x, coef)
-        learned = {"intercept_um": intercept, "condition": task.condition(), "n_rows": pool.count.astype(int)} | learned
+        own = {"intercept_um": task.intercept_um(coef), "condition": task.condition(), "n_rows": pool.count.astype(int)}
+        learned = own | learned
         columns = {name: values.tolist() for name, values in learned.items()}
         return [
             self._learned(design, {"coef_um_per_K": coef[f], **{n: v[f] for n, v in columns.items() if v[f] == v[f]}})
@@ -271,39 +285,25 @@ class Linear(Family):
     def _solve(self, task: Task) -> tuple[Array, dict[str, NDArray[Any]]]:
         """Coefficients (F, p) per unit of the inputs, and further quantities to store, each (F,); NaN is dropped."""
 
-    def _spread(self, task: Task, path: Callable[[Pool], Array], chosen: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+    def _spread(self, task: Task, path: CoefPath, chosen: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
         """Coefficients for `sd_um`, for families with `has_sd`."""
         if not self.has_sd:
             return {}
         square = mean_square(task.design.x, task.design)
-        a, b = left_out_spread(task.design, square, task.masks, task.scaled, path, chosen)
+        a, b = left_out_spread(task, square, path, chosen)
         return {"variance_um2": a, "variance_growth_um2": b}
 
 
 class Tuned(Linear):
     """A linear family with one setting, chosen in every fold inside the fold's training batches.
 
-    The score is the mean S over batches left out: by `order_by` "leave_batch_out" each in turn; by "forward" every one
-    from the third in time on, predicted from those before it. Fewer than 6 batches, or undated ones, are left out in
-    turn; of fewer than 3 contiguous quarters (`models.base.inner_groups`).
+    The score is the mean S over batches left out as `order_by` says (`Task.chosen`).
     """
 
     order_by = "leave_batch_out"
 
     def _solve(self, task: Task) -> tuple[Array, dict[str, NDArray[Any]]]:
-        chosen, n = np.zeros(len(task.masks), np.int64), task.masks.sum(axis=1)
-        known = task.design.batches  # of a design made by hand batches are in order as they come
-        place = np.argsort(in_time(known)) if known else np.arange(task.design.n_batches)
-        forward = self.order_by == "forward" and not (known and forward_obstacle(known))
-        ahead, few = forward & (n >= _ENOUGH_FOR_FORWARD), n < _ENOUGH_BATCHES
-        for some, order in ((ahead, place), (~ahead & ~few, None)):
-            if some.any():
-                S_um = left_out_mean_S_um(task.blocks, task.masks[some], task.scaled, self._path, order)
-                chosen[some] = np.argmin(S_um, axis=1)
-        if few.any():
-            quarters = Blocks.of(task.design.quarters)
-            masks = np.repeat(task.masks[few], 4, axis=1) & (quarters.count > 0)
-            chosen[few] = np.argmin(left_out_mean_S_um(quarters, masks, task.scaled, self._path), axis=1)
+        chosen = task.chosen(self._path, self.order_by)
         coef, setting = self._refit(task, chosen)
         return coef, setting | self._spread(task, self._path, chosen)
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from data.arrays import Array
 from data.errors import InputError
 from models.linear import Pool, Tuned
+from models.solvers.pooled_sums import mean_diagonal
 
 
 class Ridge(Tuned):
@@ -41,17 +42,11 @@ class Ridge(Tuned):
     def _path(self, pool: Pool) -> Array:
         values, vectors = np.linalg.eigh(pool.xx)
         scores = np.einsum("sji,sj->si", vectors, pool.xy)
-        alpha = _mean_square(pool)[:, None, None] * self._grid()
+        alpha = mean_diagonal(pool.xx)[:, None, None] * self._grid()
         weights = scores[:, :, None] / (np.maximum(values, 0.0)[:, :, None] + alpha)
         out: Array = (vectors @ weights) / pool.scale[:, :, None]
         return out
 
     def _setting(self, pool: Pool, chosen: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
         k = self._grid()[chosen]
-        return {"k": k, "alpha": k * _mean_square(pool)}
-
-
-def _mean_square(pool: Pool) -> Array:
-    """trace(XᵀX)/p (S,); 1 where no input moves."""
-    mean = np.einsum("sjj->s", pool.xx) / pool.xx.shape[1]
-    return np.where(mean > 0, mean, 1.0)
+        return {"k": k, "alpha": k * mean_diagonal(pool.xx)}

@@ -7,13 +7,13 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from data.arrays import Array
 from features.design import Design
-from models.base import Family, Plain
+from models.base import Family
 from models.program import Builder
 from models.solvers.batches import bridged, padded, steps_s, too_few_rows, unpadded
+from models.solvers.lags import behind
 
 EXPONENTS = (1.0, 0.5, 0.75, 1.25, 1.5, 1.75, 2.0)  # 1 first: it is kept where there is one speed
 _TAU_GRID_S = np.geomspace(120.0, 43200.0, 25)
@@ -58,6 +58,8 @@ class ThermalExponential(Family):
         for fold in folds:
             if counts[list(fold)].sum() < need:
                 raise too_few_rows(self.key, design, fold, int(counts[list(fold)].sum()), need)
+        y_um, use = padded(design, np.where(known, design.y_um, 0.0)), padded(design, known.astype(float)) > 0
+        inside, steps = padded(design, np.ones(len(known))) > 0, steps_s(design)
         channel, speed = _speed_rpm(design)
         has_speed = ~np.isnan(speed.sum(axis=1))
         by_law: dict[bool, list[int]] = {}
@@ -66,14 +68,19 @@ class ThermalExponential(Family):
         out: dict[int, Self] = {}
         for follows, members in by_law.items():
             loads = [_load(speed, m) for m in EXPONENTS] if follows else [np.ones_like(speed)]
-            grid = _Sums.build(design, loads, known)
+            gram, with_y = _sums(loads, y_um, use, steps)
             for f in members:
-                m, one_s, two_s = grid.best(folds[f], self.lags)
-                sse, plain = _refined(design, list(folds[f]), loads[m], known, one_s)
-                if two_s is not None and sse > _EXACT * grid.yy[list(folds[f])].sum():
-                    sse_two, plain_two = _refined(design, list(folds[f]), loads[m], known, two_s)
-                    plain = plain_two if sse - sse_two > _WORTH * sse else plain
-                plain |= {"exponent": EXPONENTS[m], "speed_channel": channel if follows else ""}
+                fold = list(folds[f])
+                longest_s = np.nan_to_num((inside[fold].sum(axis=1) - 1) * steps[fold]).max()
+                m, one_s, two_s = _best(gram[fold].sum(axis=0), with_y[fold].sum(axis=0), longest_s, self.lags)
+                own = loads[m][fold], y_um[fold], use[fold], steps[fold]
+                sse, tau_s, amplitude_um = _refined(*own, one_s)
+                if two_s is not None and sse > _EXACT * (y_um[fold] ** 2).sum():
+                    sse_two, *both = _refined(*own, two_s)
+                    tau_s, amplitude_um = both if sse - sse_two > _WORTH * sse else (tau_s, amplitude_um)
+                plain = {"tau_s": tau_s, "amplitude_um": amplitude_um,
+                         "mean_load": float(loads[m][fold][inside[fold]].mean()), "exponent": EXPONENTS[m],
+                         "speed_channel": channel if follows else ""}  # fmt: skip
                 out[f] = self._learned(design, plain)
         return [out[f] for f in range(len(folds))]
 
@@ -90,7 +97,7 @@ class ThermalExponential(Family):
         steps = steps_s(design)
         total = np.zeros_like(load)
         for tau_s, amplitude in zip(taus_s, amplitudes, strict=True):
-            total += amplitude * lag_response(load, tau_s, steps)
+            total += amplitude * behind(load, tau_s, steps)
         rows = unpadded(design, total)
         return [rows[design.rows(k)] for k in batches]
 
@@ -106,74 +113,53 @@ class ThermalExponential(Family):
         return 2 * int(np.size(self.fitted["tau_s"])) + (1 if self.fitted["speed_channel"] else 0)
 
 
-def lag_response(load: Array, tau_s: float, step_s: Array) -> Array:
-    """τ dv/dt + v = load from v = 0 at the first row, exact for a load held over each step, (K, n); steps (K,)."""
-    driven = load.copy()
-    driven[:, :1] = 0.0
-    out = np.zeros_like(load)
-    for step in np.unique(step_s[np.isfinite(step_s)]):
-        keep = float(np.exp(-step / tau_s))
-        which = step_s == step
-        out[which] = lfilter([1.0 - keep], [1.0, -keep], driven[which], axis=1)
-    return out
+def _sums(loads: Sequence[Array], y_um: Array, use: NDArray[np.bool_], step_s: Array) -> tuple[Array, Array]:
+    """Per batch the products of M loads behind every τ with one another (K, M, T, T) and with the error (K, M, T)."""
+    gram = np.empty((len(y_um), len(loads), len(_TAU_GRID_S), len(_TAU_GRID_S)))
+    with_y = np.empty(gram.shape[:3])
+    for m, load in enumerate(loads):
+        lags = np.stack([behind(load, tau, step_s) for tau in _TAU_GRID_S], axis=1) * use[:, None]
+        gram[:, m] = lags @ lags.transpose(0, 2, 1)
+        with_y[:, m] = np.einsum("ktn,kn->kt", lags, y_um)
+    return gram, with_y
 
 
-class _Sums:
-    """Cross-products of the lag responses per batch: gram (K, M, T, T), with_y (K, M, T), yy and longest_s (K,)."""
+def _best(gram: Array, h: Array, longest_s: float, lags: int) -> tuple[int, Array, Array | None]:
+    """Exponent's index with the least sum of squares over a fold, its best τ alone and best pair of τ, s.
 
-    def __init__(self, gram: Array, with_y: Array, yy: Array, longest_s: Array) -> None:
-        self.gram, self.with_y, self.yy, self.longest_s = gram, with_y, yy, longest_s
-
-    @classmethod
-    def build(cls, design: Design, loads: Sequence[Array], known: NDArray[np.bool_]) -> _Sums:
-        steps = steps_s(design)
-        weight = padded(design, known.astype(float))
-        y = padded(design, np.where(known, design.y_um, 0.0))
-        gram = np.empty((design.n_batches, len(loads), len(_TAU_GRID_S), len(_TAU_GRID_S)))
-        with_y = np.empty(gram.shape[:3])
-        for m, load in enumerate(loads):
-            lags = np.stack([lag_response(load, tau, steps) for tau in _TAU_GRID_S], axis=1) * weight[:, None]
-            gram[:, m] = lags @ lags.transpose(0, 2, 1)
-            with_y[:, m] = np.einsum("ktn,kn->kt", lags, y)
-        ends = np.diff(design.offsets) - 1
-        return cls(gram, with_y, (y**2).sum(axis=1), np.nan_to_num(ends * steps))
-
-    def best(self, fold: Sequence[int], lags: int) -> tuple[int, Array, Array | None]:
-        """Exponent's index with the least sum of squares over a fold, its best τ alone and best pair of τ, s."""
-        batches = list(fold)
-        gram, h = self.gram[batches].sum(axis=0), self.with_y[batches].sum(axis=0)
-        limit_s = max(2.0 * float(self.longest_s[batches].max()), float(_TAU_GRID_S[1]))
-        allowed = np.less_equal(_TAU_GRID_S, limit_s)
-        power = np.einsum("mtt->mt", gram)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            one = np.where(allowed & (power > 0), h**2 / power, 0.0)
-            det = power[:, :, None] * power[:, None, :] - gram**2
-            cross = h[:, :, None] * h[:, None, :]
-            two = h[:, :, None] ** 2 * power[:, None, :] - 2 * cross * gram + h[:, None, :] ** 2 * power[:, :, None]
-            apart = _TAU_GRID_S[None, :] >= _LEAST_RATIO * _TAU_GRID_S[:, None]
-            fine = apart & allowed[None, :] & (det > 1e-9 * power[:, :, None] * power[:, None, :])
-            two = np.where(fine, two / det, 0.0)
-        gain = two.max(axis=(1, 2)) if lags > 1 else one.max(axis=1)
-        # A tie within rounding goes to the first exponent: a single speed does not distinguish them.
-        m = int(np.argmax(gain >= gain.max() * (1.0 - 1e-9)))
-        alone = _TAU_GRID_S[[int(one[m].argmax())]]
-        if lags < 2 or two[m].max() <= one[m].max():
-            return m, alone, None
-        i, j = np.unravel_index(int(two[m].argmax()), two[m].shape)
-        return m, alone, _TAU_GRID_S[[i, j]]
+    gram (M, T, T) and h (M, T) are the fold's sums; its longest batch bounds τ.
+    """
+    allowed = np.less_equal(_TAU_GRID_S, max(2.0 * longest_s, float(_TAU_GRID_S[1])))
+    power = np.einsum("mtt->mt", gram)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one = np.where(allowed & (power > 0), h**2 / power, 0.0)
+        det = power[:, :, None] * power[:, None, :] - gram**2
+        cross = h[:, :, None] * h[:, None, :]
+        two = h[:, :, None] ** 2 * power[:, None, :] - 2 * cross * gram + h[:, None, :] ** 2 * power[:, :, None]
+        apart = _TAU_GRID_S[None, :] >= _LEAST_RATIO * _TAU_GRID_S[:, None]
+        fine = apart & allowed[None, :] & (det > 1e-9 * power[:, :, None] * power[:, None, :])
+        two = np.where(fine, two / det, 0.0)
+    gain = two.max(axis=(1, 2)) if lags > 1 else one.max(axis=1)
+    # A tie within rounding goes to the first exponent: a single speed does not distinguish them.
+    m = int(np.argmax(gain >= gain.max() * (1.0 - 1e-9)))
+    alone = _TAU_GRID_S[[int(one[m].argmax())]]
+    if lags < 2 or two[m].max() <= one[m].max():
+        return m, alone, None
+    i, j = np.unravel_index(int(two[m].argmax()), two[m].shape)
+    return m, alone, _TAU_GRID_S[[i, j]]
 
 
 def _refined(
-    design: Design, batches: list[int], load: Array, known: NDArray[np.bool_], taus_s: Array
-) -> tuple[float, Plain]:
-    """Time constants polished by Gauss–Newton steps on log τ, shortened until they help; amplitudes solved anew."""
-    steps = steps_s(design)[batches]
-    use = (padded(design, known.astype(float)) > 0)[batches]
-    y = padded(design, np.where(known, design.y_um, 0.0))[batches][use]
-    load = load[batches]
+    load: Array, y_um: Array, use: NDArray[np.bool_], steps: Array, taus_s: Array
+) -> tuple[float, Array, Array]:
+    """Sum of squares, τ polished by Gauss–Newton steps on log τ, shortened until they help, and amplitudes solved anew.
+
+    All of the batches of a fold, as `padded` lays them out.
+    """
+    y = y_um[use]
 
     def solve(log_tau: Array) -> tuple[float, Array, list[Array], Array]:
-        lags = [lag_response(load, float(np.exp(v)), steps) for v in log_tau]
+        lags = [behind(load, float(np.exp(v)), steps) for v in log_tau]
         basis = np.stack([lag[use] for lag in lags])
         amplitude: Array = np.linalg.lstsq(basis @ basis.T, basis @ y, rcond=1e-12)[0].astype(float)
         residual = y - amplitude @ basis
@@ -196,8 +182,7 @@ def _refined(
         log_tau, (sse, amplitude, lags, basis) = trial, found
         if moved < 1e-5:
             break
-    inside = padded(design, np.ones(len(design.time_s)))[batches] > 0
-    return sse, {"tau_s": np.exp(log_tau), "amplitude_um": amplitude, "mean_load": float(load[inside].mean())}
+    return sse, np.exp(log_tau), amplitude
 
 
 def _allowed(log_tau: Array) -> Array:
@@ -212,14 +197,10 @@ def _allowed(log_tau: Array) -> Array:
 
 def _lag_slope(load: Array, tau_s: float, step_s: Array, lag: Array) -> Array:
     """d lag / d log τ, (K, n), from the recursion's own derivative."""
-    out = np.zeros_like(load)
-    for step in np.unique(step_s[np.isfinite(step_s)]):
-        keep = float(np.exp(-step / tau_s))
-        which = step_s == step
-        driven = np.zeros_like(load[which])
-        driven[:, 1:] = keep * step / tau_s * (lag[which, :-1] - load[which, 1:])
-        out[which] = lfilter([1.0], [1.0, -keep], driven, axis=1)
-    return out
+    ratio = step_s / tau_s
+    driven = np.zeros_like(load)
+    driven[:, 1:] = (ratio * np.exp(-ratio) / -np.expm1(-ratio))[:, None] * (lag[:, :-1] - load[:, 1:])
+    return behind(driven, tau_s, step_s)
 
 
 def _load(speed_rpm: Array, exponent: float) -> Array:

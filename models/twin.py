@@ -9,12 +9,11 @@ from typing import Self
 import numpy as np
 
 from data.arrays import Array
-from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
 from features.design import Design
 from models.base import Family, Plain
-from models.solvers.batches import Recent, by_batch, too_few_rows
+from models.solvers.batches import Recent, by_batch, only, too_few_rows
 from models.solvers.twin_folds import Calibrated, Calibrations, TwinRun
 from twin.compile import compile_network
 from twin.network import Network
@@ -58,12 +57,6 @@ class Twin(Family):
             InputError: no twin part, a target that it lacks, no usable row, no batch that can be simulated, or a
                 calibration that fails.
         """
-        calibrated = self.calibrated(design, folds)
-        text = _machine(self.key, design).model_dump_json()
-        return [self._learned(design, self._plain(text, c)) for c in calibrated]
-
-    def calibrated(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Calibrated]:
-        """The calibration of every fold; see `fit_folds`."""
         work = self._calibrations(design)
         if design.target and design.target not in (known := [e.channel for e in work.network.errors]):
             raise InputError(
@@ -76,19 +69,26 @@ class Twin(Family):
                 raise too_few_rows(self.key, design, fold, usable, 2)
         every = sorted({k for fold in folds for k in fold}) if len(folds) >= _FEW else None
         try:
-            return [work.of(fold, every) for fold in folds]
+            calibrated = [work.of(fold, every) for fold in folds]
         except WorkError as error:
             raise InputError(f"family {self.key}: {error}") from None
+        text = _machine(self.key, design).model_dump_json()
+        return [self._learned(design, self._plain(text, c)) for c in calibrated]
 
     def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """Error_um (n_k,) per batch, 0 at its start; NaN where a batch lacks a driver or surrounding."""
-        run = TwinRun.of(self.network, [design.batches[k] for k in batches])
-        return np.split(self._simulated(run, [self])[0][0], np.cumsum(run.n_rows)[:-1])
+        some = only(design, batches)
+        return self._outputs(some, TwinRun.of(self.network, some.batches), [self], [range(some.n_batches)])[0]
 
     def respond_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
     ) -> list[list[Array]]:
-        run = run_of(design, fitted[0].fitted["machine"])
+        return self._outputs(design, run_of(design, fitted[0].fitted["machine"]), fitted, wanted)
+
+    def _outputs(
+        self, design: Design, run: TwinRun, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
+    ) -> list[list[Array]]:
+        """What `respond_folds` gives, from a run of the design's batches."""
         return by_batch(design, self._simulated(run, fitted)[0].T, wanted)
 
     def n_parameters(self) -> int:
@@ -119,11 +119,16 @@ class Twin(Family):
     def _simulated(self, run: TwinRun, fitted: Sequence[Self]) -> tuple[Array, Array]:
         """Error_um (F, n) and readings (F, n, sensors) on all rows of a run, of F fitted copies with one machine."""
         values, start_K = np.stack([f.values() for f in fitted]), np.stack([f._usual_K() for f in fitted])
-        return run.rows(values, start_K, [e.channel for e in run.network.errors].index(fitted[0].target))
+        return run.rows(values, start_K, error_of(run.network, fitted[0].target))
 
     def _calibrations(self, design: Design) -> Calibrations:
-        machine = _machine(self.key, design)
-        return calibrations_of(machine.model_dump_json(), design.batches, self.every_s, self.channels)
+        """Those of the design's batches, the same for every error channel that is learned from them."""
+        machine = _machine(self.key, design).model_dump_json()
+
+        def make() -> Calibrations:
+            return Calibrations(Machine.model_validate_json(machine), design.batches, self.every_s, self.channels)
+
+        return _CALIBRATIONS.of((machine, self.every_s, self.channels), design.batches, make)
 
 
 def _machine(key: str, design: Design) -> Machine:
@@ -147,15 +152,9 @@ def network_of(machine: str) -> Network:
     return compile_network(Machine.model_validate_json(machine))
 
 
-def calibrations_of(
-    machine: str, batches: tuple[Batch, ...], every_s: float, channels: tuple[str, ...]
-) -> Calibrations:
-    """The calibrations of these batches, the same for every error channel that is learned from them."""
-
-    def make() -> Calibrations:
-        return Calibrations(Machine.model_validate_json(machine), batches, every_s, channels)
-
-    return _CALIBRATIONS.of((machine, every_s, channels), batches, make)
+def error_of(network: Network, target: str) -> int:
+    """The number of an error channel among those of a network."""
+    return [e.channel for e in network.errors].index(target)
 
 
 def run_of(design: Design, machine: str) -> TwinRun:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from dataclasses import replace
 from threading import RLock
 from typing import Generic, TypeVar
 
@@ -30,6 +31,17 @@ def unpadded(design: Design, values: Array) -> Array:
     """The inverse of `padded`: (K, longest, …) back to rows (n, …)."""
     at_batch, at_row = _places(design)
     return values[at_batch, at_row]
+
+
+def only(design: Design, batches: Sequence[int]) -> Design:
+    """Some batches of a design, in the order given."""
+    rows = np.concatenate([np.empty(0, np.int64), *(np.arange(*design.offsets[k : k + 2]) for k in batches)])
+    offsets = np.concatenate([[0], np.cumsum(np.diff(design.offsets)[list(batches)])]).astype(np.int64)
+    return replace(design, batch_ids=tuple(design.batch_ids[k] for k in batches), x=design.x[rows],
+                   y_um=design.y_um[rows], time_s=design.time_s[rows], offsets=offsets,
+                   drivers=design.drivers[rows] if design.driver_names else design.drivers,
+                   batches=tuple(design.batches[k] for k in batches) if design.batches else (), _columns=None,
+                   _parent=None)  # fmt: skip
 
 
 def by_batch(design: Design, columns: Array, wanted: Sequence[Sequence[int]]) -> list[list[Array]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,6 +39,30 @@ class Pool:
         out = self.xx / (spread[:, :, None] * spread[:, None, :])
         np.einsum("sjj->sj", out)[flat] = 1.0
         return out, spread
+
+
+CoefPath = Callable[
+    [Pool], Array
+]  # coefficients (S, p, G) per unit of the inputs for all settings on every set of a pool
+
+
+def ridge_path(pool: Pool, penalties: Sequence[float] | Array) -> Array:
+    """Coefficients (S, p, G) that solve (XX + k trace(XX)/p) β = Xy for every penalty k."""
+    alpha = mean_diagonal(pool.xx)
+    out = np.empty((*pool.xy.shape, len(penalties)))
+    matrix = pool.xx.copy()
+    diagonal = np.einsum("sjj->sj", matrix)
+    own = diagonal.copy()
+    for g, k in enumerate(penalties):
+        diagonal[:] = own + k * alpha[:, None]
+        out[:, :, g] = np.linalg.solve(matrix, pool.xy[:, :, None])[:, :, 0]
+    return out
+
+
+def mean_diagonal(xx: Array) -> Array:
+    """trace(XX)/p (S,), the mean sum of squares of the inputs; 1 where none moves."""
+    mean = np.einsum("sjj->s", xx) / xx.shape[1]
+    return np.where(mean > 0, mean, 1.0)
 
 
 @dataclass(frozen=True)
@@ -114,26 +138,36 @@ class Blocks:
 
 
 def left_out_mean_S_um(
-    blocks: Blocks, masks: Mask, scaled: bool, path: Callable[[Pool], Array], place: NDArray[np.int64] | None = None
+    blocks: Blocks, masks: Mask, scaled: bool, path: CoefPath, place: NDArray[np.int64] | None = None
 ) -> Array:
     """For every training set, masks (F, B), the mean S over its blocks, each left out once, by setting; (F, G) in µm.
 
-    `path` fits all G settings on every set of a pool: coefficients (S, p, G) per unit of the inputs. Equal
-    training sets are fitted once. `place`: as for `inner_sets`.
+    `place`: as for `inner_sets`.
     """
     outer, left, sets, which = inner_sets(masks, place)
-    step = max(1, AT_ONCE // blocks.mean_x.shape[1] ** 2)
-    S_um: Array | None = None
-    for start in range(0, len(sets), step):
-        pool = blocks.pool(sets[start : start + step], scaled)
-        rows = np.flatnonzero((which >= start) & (which < start + step))
-        part = blocks.left_out_S_um(left[rows], pool, which[rows] - start, path(pool))
-        S_um = np.empty((len(left), part.shape[1])) if S_um is None else S_um
-        S_um[rows] = part
-    assert S_um is not None
+    parts = [
+        (some, blocks.left_out_S_um(left[some], pool, at, coef))
+        for some, at, pool, coef in fitted_paths(blocks, sets, which, scaled, path)
+    ]
+    S_um = np.concatenate([part for _, part in parts])[np.argsort(np.concatenate([some for some, _ in parts]))]
     border = np.searchsorted(outer, np.arange(len(masks)))
     total = np.add.reduceat(S_um, border, axis=0)
     return np.asarray(total / np.bincount(outer, minlength=len(masks))[:, None])
+
+
+def fitted_paths(
+    blocks: Blocks, sets: Mask, which: NDArray[np.int64], scaled: bool, path: CoefPath
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], Pool, Array]]:
+    """All settings on every one of the training sets (S, B), so many at a time as memory holds.
+
+    Yields:
+        places in `which` (V,) of the sets at hand, which of these each is, their pool, coefficients (S, p, G).
+    """
+    step = max(1, AT_ONCE // blocks.mean_x.shape[1] ** 2)
+    for start in range(0, len(sets), step):
+        pool = blocks.pool(sets[start : start + step], scaled)
+        some = np.flatnonzero((which >= start) & (which < start + step))
+        yield some, which[some] - start, pool, path(pool)
 
 
 def inner_sets(

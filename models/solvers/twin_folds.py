@@ -53,12 +53,10 @@ class Calibrated:
     scatter of a batch's own about it. `left_out` gives, by training batch, the values and the start of the others.
     """
 
-    train: tuple[int, ...]
     values: Array
     start_K: Array
     start_cov_K2: Array
     left_out: dict[int, tuple[Array, Array]]
-    rounds: int
     message: str
 
 
@@ -164,7 +162,8 @@ class Calibrations:
         return self._ends[key]
 
     def _calibrated(self, key: tuple[int, ...], begin: _Point | None) -> tuple[Calibrated, _Point]:
-        at = [self.used[k] for k in key if k in self.used]
+        kept = [k for k in key if k in self.used]
+        at = [self.used[k] for k in kept]
         problem = self.problem.only(at)
         if begin is None:
             point = _from_file(problem, at)
@@ -172,16 +171,15 @@ class Calibrations:
             place = [begin.at.index(i) for i in at]
             nuisance, blocks = [begin.nuisance[k] for k in place], [begin.blocks[k] for k in place]
             point = _Point(at, begin.z, nuisance, blocks, begin.taken_at)
-        point, noise, rounds, message = _arrived(problem, point)
+        point, noise, message = _arrived(problem, point)
         values = problem.values_at(x_of(problem.unknowns, point.z))
         own = _own_starts_K(problem, values, point.nuisance)
         typical, scatter = _typical(self.network, own)
-        kept = [k for k in key if k in self.used]
         left_out = {
             k: (problem.values_at(x_of(problem.unknowns, z)), _typical(self.network, np.delete(own, i, axis=0))[0])
             for i, (k, z) in enumerate(zip(kept, _without_each(problem, point, noise), strict=True))
         }
-        return Calibrated(key, values, typical, scatter, left_out, rounds, message), point
+        return Calibrated(values, typical, scatter, left_out, message), point
 
 
 def _thinned(batch: Batch, every_s: float) -> Batch:
@@ -225,7 +223,7 @@ def _linearised(problem: CalibrationProblem, z: Array, nuisance: list[Array]) ->
     return list(problem.linearise(x_of(problem.unknowns, z), nuisance))
 
 
-def _arrived(problem: CalibrationProblem, point: _Point) -> tuple[_Point, Noise, int, str]:
+def _arrived(problem: CalibrationProblem, point: _Point) -> tuple[_Point, Noise, str]:
     """The optimum under noise that follows from its own residuals."""
     low, high = z_bounds(problem.unknowns)
     channels = [b.channel for b in point.blocks]
@@ -242,7 +240,7 @@ def _arrived(problem: CalibrationProblem, point: _Point) -> tuple[_Point, Noise,
         way = float(np.sum((arrow.root @ (point.z - point.taken_at)) ** 2))
         small = gain <= CLOSE
         if small and noise.change(before) < SETTLED and way <= FAR:
-            return replace(point, blocks=blocks), noise, number, f"arrived after {number} rounds"
+            return replace(point, blocks=blocks), noise, f"arrived after {number} rounds"
         due = (way > FAR and (small or number % 3 == 0)) or (stalled and way > NEAR and not small)
         moved = None if due else _step(problem, point, arrow, dz, blocks, noise, cost)
         if moved is None and (due or way > 0):
@@ -257,7 +255,7 @@ def _arrived(problem: CalibrationProblem, point: _Point) -> tuple[_Point, Noise,
         z, nuisance, residuals = moved
         stalled = cost - _cost(z, nuisance, residuals, blocks, noise) < _KEPT * gain
         point = replace(point, z=z, nuisance=nuisance)
-    return replace(point, blocks=blocks), noise, ROUNDS, f"still moving after {ROUNDS} rounds"
+    return replace(point, blocks=blocks), noise, f"still moving after {ROUNDS} rounds"
 
 
 def _towards(before: Noise, after: Noise, share: float) -> Noise:
@@ -346,10 +344,6 @@ class TwinRun:
         substeps = choose_substeps(network, network.values, inputs, "settled", SUBSTEPS_K)
         return cls(network, tuple(batches), used, inputs.refined(substeps))
 
-    @property
-    def n_rows(self) -> list[int]:
-        return [b.n_rows for b in self.batches]
-
     def only(self, numbers: Sequence[int]) -> TwinRun:
         """Some of the batches."""
         place = {int(k): i for i, k in enumerate(self.used)}
@@ -364,7 +358,7 @@ class TwinRun:
 
     def by_batch(self, series: Array | None) -> list[Array]:
         """A series (used batches, K) as one array (n_k,) per batch, NaN for one that cannot be simulated."""
-        out = [np.full(n, np.nan) for n in self.n_rows]
+        out = [np.full(b.n_rows, np.nan) for b in self.batches]
         for i, k in enumerate(self.used):
             assert series is not None
             out[k] = series[i, : len(out[k])]
@@ -385,7 +379,7 @@ class TwinRun:
         return errors[..., error], readings
 
     def _simulated(self, values: Array, start_K: Array) -> tuple[Array, Array]:
-        n_sets, borders = len(values), np.cumsum([0, *self.n_rows])
+        n_sets, borders = len(values), np.cumsum([0, *(b.n_rows for b in self.batches)])
         errors = np.full((n_sets, borders[-1], len(self.network.errors)), np.nan)
         readings = np.full((n_sets, borders[-1], len(self.network.readings)), np.nan)
         if self.inputs is not None:

@@ -43,6 +43,10 @@ def test_keys_are_those_of_the_registry() -> None:
     ("distributed_lag", {"lag_min": 0}, "expected lag_min above 0"),
     ("transfer_function", {"poles": 3}, "family transfer_function: poles is 3, expected 0, 1 or 2; choose one"),
     ("axis_coupled", {"max_terms": 1}, r"max_terms 1, worth 0.01; expected at least 2 terms and 0 <= worth < 1"),
+    ("twin", {"start": "warm"}, "start is 'warm', expected 'usual' or 'settled'"),
+    ("twin_residual", {"residual": "forest"}, "residual is 'forest', expected ridge or gp"),
+    ("twin_kalman", {"residual": "gp"}, "residual is 'gp', expected ridge or none"),
+    ("twin_kalman", {"heat_spread": -1}, "heat_spread is -1"),
     ("gm1n", {"response": "whitenin"}, "did you mean 'whitening'"),
     ("gm_dl", {"banded": "bath"}, "unknown banded 'bath': did you mean 'both'"),
     ("gm_dl", {"bands": 0}, "bands 0, least_batches 4; expected at least 1"),
@@ -65,7 +69,8 @@ def test_impossible_options_are_told(key: str, options: dict[str, Any], words: s
 
 @pytest.mark.parametrize(("key", "need"), [
     ("mlr", 4), ("ridge", 4), ("pcr", 4), ("pcr_lbo", 4), ("pls", 4), ("distributed_lag", 4), ("gaussian_process", 4),
-    ("gru", 4), ("lstm", 4), ("tcn", 4), ("transfer_function", 8), ("lssvm", 2), ("svr", 2), ("bp", 2),
+    ("lag_dictionary", 4), ("gru", 4), ("lstm", 4), ("tcn", 4), ("transfer_function", 8), ("lssvm", 2), ("svr", 2),
+    ("bp", 2),
 ])  # fmt: skip
 def test_too_few_rows_are_told_in_one_line(key: str, need: int) -> None:
     design = by_hand()
@@ -78,6 +83,16 @@ def test_too_few_rows_are_told_in_one_line(key: str, need: int) -> None:
     )
 
 
+@pytest.mark.parametrize(("key", "words"), [
+    *((k, f"^{k}: no inputs given for z; name at least one channel$") for k in ("mlr", "ridge", "pcr", "pls")),
+    ("lag_dictionary", "^lag_dictionary: no inputs given for z; name a channel$"),
+    ("transfer_function", "got 0 inputs for z, expected 1 to 60; let a selector choose"),
+])  # fmt: skip
+def test_without_inputs_a_channel_or_a_selector_is_asked_for(key: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        FAMILIES[key]().fit_folds(runs.design(False).subset(()), [[0]])
+
+
 def by_hand() -> Design:
     """The suite's five runs as rows alone."""
     made = runs.design(False)
@@ -85,13 +100,14 @@ def by_hand() -> Design:
                   made.step_s, input_units=made.input_units)  # fmt: skip
 
 
-@pytest.mark.parametrize("key", [
-    "mlr", "ridge", "pcr", "pcr_lbo", "pls", "bp", "bp_linear", "gaussian_process", "transfer_function",
+@pytest.mark.parametrize(("key", "options"), [
+    *((key, {}) for key in ("mlr", "ridge", "pcr", "pcr_lbo", "pls", "bp", "bp_linear", "gaussian_process")),
+    ("transfer_function", {}), ("transfer_function", {"drivers": True}),
 ])  # fmt: skip
 @pytest.mark.parametrize("form", ["default", "published"])
-def test_all_folds_at_once_are_the_folds_one_by_one(key: str, form: str) -> None:
+def test_all_folds_at_once_are_the_folds_one_by_one(key: str, options: dict[str, Any], form: str) -> None:
     """Folds that share work with others, and folds unlike all others, of runs of different lengths."""
-    design, family = runs.design(False), FAMILIES[key]()
+    design, family = runs.design(False), FAMILIES[key](**options)
     family = family if form == "default" else family.as_published()
     short = (design.group == 1) & (np.arange(len(design.x)) >= design.offsets[2] - runs.N // 3)
     design = replace(design, y_um=np.where(short, np.nan, design.y_um))

@@ -10,9 +10,8 @@ from data.batch import Batch, Channel
 from features.design import Design
 from models.distributed_lag import DistributedLag
 from models.gm1n import GM1N
-from models.gm_dl import GMDL
+from models.gm_dl import GMDL, band_weights, bands_of, start_temperatures_degC
 from models.solvers.grey_models import grey_layers, layer_design
-from models.solvers.start_bands import band_weights, bands_of, start_temperatures_degC
 
 STARTS_DEGC = (4.0, 31.0, 12.0, 5.0, 19.0, 30.0, 20.0, 6.0, 18.0, 29.0, 21.0, 13.0)
 INPUTS = ("head", "bed")
@@ -44,24 +43,24 @@ def rms_um(model, design, k) -> float:
     return float(np.sqrt(np.mean((model.predict_design(design, [k])[0] - design.y_um[design.rows(k)]) ** 2)))
 
 
-def test_bands_of_equally_many_batches_from_cold_to_warm():
-    start = np.array(STARTS_DEGC)
-    assert bands_of(start, range(12), 3, 4) == [(0, 2, 3, 7), (4, 6, 8, 11), (1, 5, 9, 10)]
-    assert bands_of(start, [0, 1, 2, 3, 4, 5, 6], 3, 2) == [(0, 2, 3), (4, 6), (1, 5)]
+@pytest.mark.parametrize(("train", "bands", "least", "want"), [
+    (range(12), 3, 4, [(0, 2, 3, 7), (4, 6, 8, 11), (1, 5, 9, 10)]),
+    (range(7), 3, 2, [(0, 2, 3), (4, 6), (1, 5)]),
+    # by edges in °C; bands that are too small join the smaller neighbour
+    (range(12), [10.0, 25.0], 3, [(0, 3, 7), (2, 4, 6, 8, 10, 11), (1, 5, 9)]),
+    (range(12), [25.0, 10.0, 15.0], 3, [(0, 2, 3, 7, 11), (4, 6, 8, 10), (1, 5, 9)]),
+    (range(12), [-5.0, 40.0], 1, [tuple(range(12))]),
+    # too few batches
+    (range(7), 3, 4, [tuple(range(7))]),
+    (range(8), 3, 4, [(0, 2, 3, 7), (1, 4, 5, 6)]),
+])  # fmt: skip
+def test_bands_from_cold_to_warm(train, bands, least, want):
+    assert bands_of(np.array(STARTS_DEGC), train, bands, least) == want
 
 
-def test_bands_by_edges_join_the_smaller_neighbour_where_they_are_too_small():
-    start = np.array(STARTS_DEGC)
-    assert bands_of(start, range(12), [10.0, 25.0], 3) == [(0, 3, 7), (2, 4, 6, 8, 10, 11), (1, 5, 9)]
-    assert bands_of(start, range(12), [25.0, 10.0, 15.0], 3) == [(0, 2, 3, 7, 11), (4, 6, 8, 10), (1, 5, 9)]
-    assert bands_of(start, range(12), [-5.0, 40.0], 1) == [tuple(range(12))]
-
-
-def test_too_few_batches_or_temperatures_give_fewer_bands():
-    start = np.array(STARTS_DEGC)
-    assert bands_of(start, range(7), 3, 4) == [tuple(range(7))]
-    assert len(bands_of(start, range(8), 3, 4)) == 2
+def test_equal_or_unknown_start_temperatures_give_fewer_bands():
     assert bands_of(np.full(12, 20.0), range(12), 3, 4) == [tuple(range(12))]
+    start = np.array(STARTS_DEGC)
     start[5] = np.nan
     assert bands_of(start, range(12), 3, 4) == [tuple(range(12))]
     assert len(bands_of(start, [0, 1, 2, 3, 4, 6, 7, 8], 2, 4)) == 2

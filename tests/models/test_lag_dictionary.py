@@ -10,11 +10,10 @@ from data.batch import Batch, Channel
 from data.errors import InputError
 from features.design import Design
 from features.rises import first_order_lag
-from models.lag_dictionary import LagDictionary
+from models.lag_dictionary import Columns, LagDictionary
 from models.metrics import residual_std_um
 from models.ridge import Ridge
 from models.solvers.batch_process import BatchProcess, ByColumns, ByRows, Windows
-from models.solvers.lags import Columns
 
 STEP_S, N = 300.0, 72
 INPUTS = ("nose", "bed")
@@ -148,19 +147,16 @@ def left_out_S_um(family, batches) -> np.ndarray:
     return np.array([residual_std_um(design.y_um[design.rows(k)] - p[0]) for k, p in enumerate(predicted)])
 
 
-def test_an_error_that_lags_its_sensor_is_found(runs) -> None:
+def cold(rise, rpm, start_degC):
+    return lagged_nose(rise, rpm, start_degC) + (start_degC - 20.0) * (1 - np.exp(-np.arange(N) * STEP_S / 7200.0))
+
+
+@pytest.mark.parametrize(("law", "most_um", "ridge_least_um"), [(lagged_nose, 0.5, 2.0), (cold, 1.0, 3.0)])
+def test_a_lag_and_what_a_cold_start_does_are_found(law, most_um, ridge_least_um) -> None:
     """4 µm/K behind 75 min, which no delay of the dictionary is; the noise is 0.2 µm and the zero has its own."""
-    assert left_out_S_um(LagDictionary(), runs).mean() < 0.5
-    assert left_out_S_um(Ridge(), runs).mean() > 2.0
-
-
-def test_what_a_cold_start_does_is_learned() -> None:
-    def cold(rise, rpm, start_degC):
-        return lagged_nose(rise, rpm, start_degC) + (start_degC - 20.0) * (1 - np.exp(-np.arange(N) * STEP_S / 7200.0))
-
-    batches = [run(k, cold) for k in range(8)]
-    assert left_out_S_um(LagDictionary(), batches).mean() < 1.0
-    assert left_out_S_um(Ridge(), batches).mean() > 3.0
+    batches = [run(k, law) for k in range(8)]
+    assert left_out_S_um(LagDictionary(), batches).mean() < most_um
+    assert left_out_S_um(Ridge(), batches).mean() > ridge_least_um
 
 
 def test_an_odd_batch_is_named_and_does_not_spoil_the_others() -> None:
@@ -221,11 +217,3 @@ def test_windows_are_means_and_not_too_many(runs) -> None:
     np.testing.assert_allclose(w.time_h[:2], [150 / 3600, 750 / 3600])
     many = Windows.of(design_of([run(k) for k in range(60)]), np.zeros((60 * N, 1)), range(60))
     assert 600 < len(many.y_um) <= 1260
-
-
-def test_too_few_rows_is_told_in_one_line(runs) -> None:
-    short = replace(runs[0], table=runs[0].table.iloc[:5])
-    with pytest.raises(
-        InputError, match=r"^family lag_dictionary: got 3 usable rows of z in K0, need at least 4; give"
-    ):
-        LagDictionary().fit([short], INPUTS, "z")

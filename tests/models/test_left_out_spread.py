@@ -1,5 +1,7 @@
 """The stated standard deviation of linear models and transfer functions: refits, planted scatter of batches, holes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from models.linear import mean_square
 from models.mlr import MLR
 from models.pcr import PCR
 from models.ridge import Ridge
+from thermodrift.testing.runs import stack
 
 NOISE_UM = 0.5
 FAMILIES_THAT_TELL = ("mlr", "ridge", "transfer_function")
@@ -26,10 +29,7 @@ def make_design(batches=8, rows=30, seed=0, own_slope=0.0, units=("K", "K")) -> 
         slope = 3 + own_slope * rng.normal()
         y.append(slope * rise[:, 0] - 2 * rise[:, 1] + rng.normal(0, NOISE_UM, rows))
         x.append(rise)
-    offsets = np.arange(0, (batches + 1) * rows, rows)
-    names = tuple(f"b{k}" for k in range(batches))
-    return Design(("a", "b"), "z", names, np.vstack(x), np.concatenate(y), np.tile(np.arange(rows) * 300.0, batches),
-                  offsets, 300.0, input_units=units)  # fmt: skip
+    return replace(stack(np.vstack(x), np.concatenate(y), [rows] * batches), input_units=units)
 
 
 def refitted(design: Design, train: list[int], penalty: float) -> tuple[float, float]:
@@ -98,7 +98,7 @@ def test_inputs_count_in_the_scale_of_their_unit_and_holes_stay_holes() -> None:
 
 def test_an_exact_model_states_none_and_a_silent_family_says_so() -> None:
     design = make_design()
-    exact = Design(design.inputs, "z", design.batch_ids, design.x, 3 * design.x[:, 0], design.time_s, design.offsets)
+    exact = replace(design, y_um=3 * design.x[:, 0])
     assert MLR().fit_design(exact, range(8)).sd_um(exact, [0])[0].max() < 1e-6
     with pytest.raises(InputError, match="family pcr: has no predictive standard deviation; choose one that has"):
         PCR().fit_design(design, range(8)).sd_um(design, [0])

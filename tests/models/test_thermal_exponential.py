@@ -1,24 +1,24 @@
 """The thermal exponential against closed forms, and what a stop does."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from features.design import Design
-from models.thermal_exponential import ThermalExponential, lag_response
+from models.solvers.lags import behind
+from models.thermal_exponential import ThermalExponential
+from thermodrift.testing.runs import stack
 
 
-def make_design(speeds, y, step_s=300.0, unit="rpm") -> Design:
+def make_design(speeds, y) -> Design:
     """One batch per series; `speeds` None makes a design without drivers."""
     sizes = [len(v) for v in y]
-    offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    time_s = np.concatenate([np.arange(n) * step_s for n in sizes])
-    driver = {}
-    if speeds is not None:
-        driver = {"drivers": np.concatenate(speeds)[:, None].astype(float), "driver_names": ("spindle",),
-                  "driver_units": (unit,)}  # fmt: skip
-    ids = tuple(f"K{k + 1}" for k in range(len(sizes)))
-    rows = int(offsets[-1])
-    return Design((), "z", ids, np.empty((rows, 0)), np.concatenate(y), time_s, offsets, step_s, **driver)
+    design = stack(np.empty((sum(sizes), 0)), np.concatenate(y), sizes)
+    if speeds is None:
+        return design
+    drivers = np.concatenate(speeds)[:, None].astype(float)
+    return replace(design, drivers=drivers, driver_names=("spindle",), driver_units=("rpm",))
 
 
 T = np.arange(100) * 300.0
@@ -49,16 +49,16 @@ def test_recovers_two_lags_and_the_exponent_over_three_speeds():
     np.testing.assert_allclose(model.fitted["amplitude_um"], [8.0, -3.0], rtol=3e-3)
 
 
-def test_lag_response_is_the_closed_form_for_steps():
+def test_a_response_is_the_closed_form_for_steps():
     load = np.concatenate([np.ones(50), np.zeros(50)])[None]
-    got = lag_response(load, 2000.0, np.array([300.0]))[0]
+    got = behind(load, 2000.0, np.array([300.0]))[0]
     np.testing.assert_allclose(got[:50], 1 - np.exp(-T[:50] / 2000), atol=1e-12)
     np.testing.assert_allclose(got[50:], got[49] * np.exp(-(T[50:] - T[49]) / 2000), atol=1e-12)
 
 
 def test_a_stop_cools_down():
     speed = np.where(T < 15000, 3000.0, 0.0)
-    error = 4.0 * 3.0 * lag_response((speed > 0).astype(float)[None], 3000.0, np.array([300.0]))[0]
+    error = 4.0 * 3.0 * behind((speed > 0).astype(float)[None], 3000.0, np.array([300.0]))[0]
     running = np.full(100, 3000.0)
     design = make_design([speed, running], [error, np.full(100, np.nan)])
     model = ThermalExponential().fit_design(design, [0])
@@ -89,8 +89,7 @@ def test_missing_errors_do_not_count_and_inputs_do_not_matter():
     errors = [rise(30.0, 3000.0), rise(30.0, 3000.0)]
     errors[1][10:40] = np.nan
     design = make_design(None, errors)
-    broken = Design(("t",), "z", design.batch_ids, np.full((200, 1), np.nan), design.y_um, design.time_s,
-                    design.offsets, 300.0)  # fmt: skip
+    broken = replace(design, inputs=("t",), x=np.full((200, 1), np.nan))
     model = ThermalExponential().fit_design(broken, [0, 1])
     assert model.fitted["tau_s"][0] == pytest.approx(3000.0, rel=1e-3)
 
