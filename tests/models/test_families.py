@@ -84,7 +84,7 @@ def test_too_few_rows_are_told_in_one_line(key: str, need: int) -> None:
 
 
 @pytest.mark.parametrize(("key", "words"), [
-    *((k, f"^{k}: no inputs given for z; name at least one channel$") for k in ("mlr", "ridge", "pcr", "pls")),
+    *((k, f"^{k}: no inputs given for z; name at least one") for k in ("mlr", "ridge", "pcr", "pcr_lbo", "pls")),
     ("lag_dictionary", "^lag_dictionary: no inputs given for z; name a channel$"),
     ("transfer_function", "got 0 inputs for z, expected 1 to 60; let a selector choose"),
 ])  # fmt: skip
