@@ -117,15 +117,13 @@ def diagnosed_cell(*rates: str) -> Diagnosis:
 
 
 @pytest.mark.slow
-def test_the_cell_lacks_the_heat_of_its_lost_voltage_and_its_charge_comes_next() -> None:
-    """The charge that swells it gains 2,700 nats and is refused as a further claim: a shortfall."""
+def test_the_cell_lacks_the_heat_of_its_lost_voltage_and_the_strain_of_its_charge() -> None:
     found = diagnosed_cell("1C", "2C", "3C", "4C")
-    (first,) = found.findings.findings
-    assert (first.mechanism, first.where.name) == ("voltage_loss_heat", "can")
+    named = {(f.mechanism, f.where.name) for f in found.findings.findings}
+    assert named == {("voltage_loss_heat", "can"), ("charge_strain", "hoop_strain")}
     mean = found.tables["rms"].groupby("channel")[["before", "after"]].mean()
-    assert (mean["after"] < 1.02 * mean["before"]).all() and mean.loc["can", "after"] < 0.5 * mean.loc["can", "before"]
-    assert found.search is not None and found.search.rounds[-1].best is not None
-    assert found.search.rounds[-1].best.candidate.mechanism == "charge_strain"
+    assert mean.loc["can", "after"] < 0.5 * mean.loc["can", "before"]
+    assert mean.loc["hoop_strain", "after"] < 0.2 * mean.loc["hoop_strain", "before"]
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from functools import partial
 from pathlib import Path
 
@@ -64,11 +65,11 @@ def test_it_is_sealed_answered_opened_and_written(tmp_path: Path) -> None:
     assert hashlib.sha256(bytes.fromhex(opened["salt"]) + plain).hexdigest() == sealed["digest"] == d.seal.digest
     assert folder_digest(out / "case") == sealed["case"]
     page = (out / "report.html").read_text(encoding="utf-8")
-    panel = page[page.index('<section class="unsealed right"') : page.index("</section>")]
-    assert "SIMULATED" in panel and "The foundation exchanges heat with the bed" in panel and d.seal.digest in panel
-    assert "Heat to the floor at bed" in panel and "conductance 22 W/K (90 %: 18 to 27)" in panel
-    assert "97\u202f%, extremely likely" in panel and "2 of 2 left-out runs improve" in panel
-    assert '<span class="was">6.0</span> → </span>'.replace(" → </span>", "") in panel and "noise 0.8 µm" in panel
+    panel = page[page.index('<div class="unsealed right"') : page.index("<header")]
+    said = " ".join(re.sub(r"<[^>]+>", " ", panel).split())
+    assert "SIMULATED" in said and "The foundation exchanges heat with the bed" in said and d.seal.digest in said
+    assert "Heat to the floor at bed conductance 22 W/K (90 %: 18 to 27)" in said
+    assert "probability 97 %, extremely likely" in said and "6.0 → " in said and "noise 0.8 µm" in said
     assert page.index("unsealed right") < page.index("<header") and "machine.yml" not in page
     again = demonstrate(7, out, effect="floor_sink", by=by("silent"))  # replaces, with another salt
     assert again.judgement.outcome == "missed" and again.seal.digest != d.seal.digest
@@ -163,4 +164,5 @@ def test_a_real_diagnosis_finds_the_foundation(tmp_path: Path, monkeypatch: pyte
     d: Demonstration = demonstrate(20261125, tmp_path / "out", effect="floor_sink")
     assert d.judgement.outcome == "found" and (tmp_path / "out" / "report.html").exists()
     rms = d.diagnosis.findings.fit.left_out_rms
-    assert rms.after["z_um"] < 0.5 * rms.before["z_um"]  # type: ignore[operator]
+    after, before, noise = (values["z_um"] for values in (rms.after, rms.before, rms.noise_floor))
+    assert after is not None and before is not None and noise is not None and after < min(before, noise)
