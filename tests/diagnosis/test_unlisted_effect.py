@@ -33,7 +33,8 @@ def found(given: Case) -> Round:
          "W into column per K of column above 20 degC, in proportion to rpm (at 5000 rpm)"),
         pytest.param(
             flux("saddle", "rpm", square="-4e-6 W"), "saddle", {"square": -4e-6},
-            "W out of saddle with the square of rpm (at 5000 rpm)", marks=pytest.mark.slow,
+            "W out of saddle with the square of rpm (at 5000 rpm)",
+            marks=[pytest.mark.slow, pytest.mark.xfail(reason="the bed under the saddle is named", strict=True)],
         ),
         (flux("bed", "rpm", "coolant", cross="0.012 W"), "bed", {"cross": 0.012},
          "W into bed in proportion to rpm (at 5000 rpm) while coolant is on"),

@@ -24,7 +24,7 @@ from diagnosis.contracts import Candidate, Fitted, Scored, Where
 from diagnosis.drafting.draft import drafted_part
 from diagnosis.findings.conclude import reported_parameters
 from diagnosis.fitting.batches import enough_batches, usable_batches
-from diagnosis.fitting.fitted import baseline, left_out_rows, refitted, relinearised
+from diagnosis.fitting.fitted import baseline, left_out_rows, refitted, relearned
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, proposed, screen
 from diagnosis.search.claims import null_quantile
@@ -215,7 +215,8 @@ def best_candidates(
 
 
 def _with(fit: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None]) -> Fitted | None:
-    """The fit with the stated terms at its optimum; None where it cannot be simulated.
+    """The fit with the stated terms at its optimum, under the covariance that is likeliest for it: structure may have
+    stood in for them. None where it cannot be simulated.
 
     As in a diagnosis, it begins with a smaller amplitude where the full one cannot be simulated: heat with positive
     feedback diverges in a network with wrong values.
@@ -224,7 +225,7 @@ def _with(fit: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None]
     for share in (1.0, *POLICY.start_amplitude_shares):
         try:
             part, at = with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit, share)
-            return relinearised(refitted(fit, part, at))
+            return relearned(refitted(fit, part, at))
         except (InputError, WorkError):
             continue
         except ValueError:  # one candidate twice
@@ -243,7 +244,7 @@ def _judged(
     own = [(t, o) for k, (t, o) in enumerate(zip(terms, found, strict=True)) if k != which and o is not None]
     part: TwinPart = with_terms(fit.part, [t for t, _ in own], [o for _, o in own], fit)[0]
     try:
-        without = [relinearised(refitted(full, part)).log_evidence, *([] if own else [fit.log_evidence])]
+        without = [relearned(refitted(full, part)).log_evidence, *([] if own else [fit.log_evidence])]
     except (InputError, WorkError):
         return _Judged()
     gain = full.log_evidence - max(without)
