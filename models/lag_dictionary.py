@@ -45,7 +45,6 @@ _REFERENCE_DEGC = 20.0
 _FULL_SCALE_K = 10.0  # a driver at full scale, and the clock, count like a rise of so many K
 _KELVIN = ("K", "degC")
 
-
 _LEVELS = (0.1, 10.0, 1000.0)  # prior variance of a gain per K, in units of what no column explains
 _STEADY = (1.0, 100.0)  # offset and noise of that, against its walk in an hour
 _SHARPNESS = 10.0  # a setting that leaves a tenth more counts e^-1 as much
