@@ -30,9 +30,9 @@ from benchmarks.table import Row, markdown, median_s
 from data.batch import Batch
 from features.design import Design
 from features.rises import temperature_inputs
-from models.crossing import Plan
-from models.lag_dictionary import DRIVEN, Columns
-from models.solvers.batch_process import ByColumns, ByRows, Windows
+from models.families.lag_dictionary import DRIVEN, Columns
+from models.numerics.batch_process import ByColumns, ByRows, Windows
+from models.selection.crossing import Plan
 
 
 @dataclass(frozen=True)

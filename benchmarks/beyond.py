@@ -23,8 +23,8 @@ from data.batch import Batch
 from data.checks import check_machine, checked
 from data.machine import Machine, load_machine
 from data.recording import read_batches, recording_files
-from models.crossing import Plan
-from models.grid import run_grid
+from models.selection.crossing import Plan
+from models.selection.grid import run_grid
 from plants.sample.sample_year import write_sample_year
 
 ROOT = Path(__file__).parent.parent

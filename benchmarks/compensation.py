@@ -23,8 +23,8 @@ from compensation.substitutes import Substitutes
 from data.batch import Batch
 from features.design import Design
 from models import FAMILIES
-from models.trust import Region
-from models.updating import Updater, out_of_fold
+from models.selection.trust import Region
+from models.selection.updating import Updater, out_of_fold
 from tests.conftest import make_toy_batches
 
 INPUTS = ("t0", "t2", "t4", "t5", "t7", "room")

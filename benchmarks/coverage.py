@@ -31,13 +31,13 @@ from data.errors import InputError
 from data.machine import Machine, load_machine
 from data.recording import read_batches
 from features.rises import zeroed_error_um
-from models.conformal import RunBound, expected_next
-from models.crossing import FamilyResult, Plan, cross_family, prepare, refit, with_target
 from models.metrics import residual_std_um
 from models.protocols import forward
-from models.result import CELL_KEYS
-from models.stack import best_cells
-from models.trust import Region, left_out_runs
+from models.selection.conformal import RunBound, expected_next
+from models.selection.crossing import FamilyResult, Plan, cross_family, prepare, refit, with_target
+from models.selection.result import CELL_KEYS
+from models.selection.stack import best_cells
+from models.selection.trust import Region, left_out_runs
 from pipelines.model_store import StoredModel
 from plants.sample.sample_year import write_sample_year
 from thermodrift_exam.plants.plant import draw

@@ -32,12 +32,12 @@ from data.machine import Machine
 from features.rises import zeroed_error_um
 from models import FAMILIES
 from models.base import Family
-from models.crossing import Plan, unfitted
-from models.grid import run_grid
 from models.metrics import residual_std_um
-from models.outlook import outlook
-from models.promotion import decide
 from models.protocols import PromotionRule
+from models.selection.crossing import Plan, unfitted
+from models.selection.grid import run_grid
+from models.selection.outlook import outlook
+from models.selection.promotion import decide
 from pipelines.fitted_model import substitutes_of
 
 LAST, BLOCK = 12, 4  # runs that are predicted, and runs between two decisions

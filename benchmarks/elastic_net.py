@@ -17,7 +17,7 @@ from sklearn.linear_model import enet_path, lars_path_gram
 from benchmarks.table import Row, markdown, median_s
 from data.arrays import Array
 from features.selectors.elastic_net_path import active_inputs
-from models.elastic_net import sparse_coefficients
+from models.families.elastic_net import sparse_coefficients
 
 INPUTS, ROWS, HALVES, FOLDS = 10, 600, 50, 30
 LEVELS, PENALTIES, MIXINGS = np.geomspace(1.0, 1e-3, 50), np.geomspace(1.0, 1e-4, 25), (1.0, 0.5, 0.1)

@@ -25,7 +25,7 @@ import pandas as pd
 
 from data.batch import Batch
 from data.machine import parse_machine
-from models.crossing import Plan
+from models.selection.crossing import Plan
 from pipelines import settings as settings_module
 from pipelines.settings import Settings
 

@@ -39,10 +39,10 @@ from benchmarks.table import Row, timed
 from data.batch import Batch
 from data.machine import Machine, load_machine
 from data.recording import read_batches
-from models.crossing import Crossing, Plan, cross_family, prepare
-from models.grid import run_grid
 from models.metrics import residual_std_um
 from models.protocols import PROTOCOLS
+from models.selection.crossing import Crossing, Plan, cross_family, prepare
+from models.selection.grid import run_grid
 from plants.sample.sample_year import write_sample_year
 
 POINTS, EVERY = 4, 5

@@ -20,9 +20,9 @@ from threadpoolctl import threadpool_limits
 from benchmarks.table import exponent
 from features.design import Design
 from models import FAMILIES
-from models.judging import FamilyScores
-from models.linear import Blocks
+from models.families.linear import Blocks
 from models.protocols import Fold
+from models.selection.judging import FamilyScores
 
 BASE = {"batches": 30, "sensors": 10, "rows": 300}
 GROWTH = {

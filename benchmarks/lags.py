@@ -28,15 +28,15 @@ from benchmarks.forward import STEP, folds, in_time, machines
 from data.arrays import Array
 from data.errors import InputError
 from features.design import Design
-from models import lag_dictionary
 from models.base import Family
-from models.distributed_lag import DistributedLag
-from models.lag_dictionary import PROMPT, UNDRIVEN, Columns, LagDictionary
+from models.families import lag_dictionary
+from models.families.distributed_lag import DistributedLag
+from models.families.lag_dictionary import PROMPT, UNDRIVEN, Columns, LagDictionary
+from models.families.mlr import MLR
+from models.families.ridge import Ridge
 from models.metrics import residual_std_um
-from models.mlr import MLR
+from models.numerics.batch_process import BatchProcess, Windows
 from models.protocols import Fold
-from models.ridge import Ridge
-from models.solvers.batch_process import BatchProcess, Windows
 
 FAMILIES: dict[str, Family] = {
     "mlr": MLR(),

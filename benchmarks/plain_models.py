@@ -23,8 +23,8 @@ from data.arrays import Array
 from features.design import Design
 from models import FAMILIES
 from models.base import inner_groups
-from models.solvers.kernels import Rows, evenly, unit_scale
-from models.solvers.trees import training_rows
+from models.numerics.kernels import Rows, evenly, unit_scale
+from models.numerics.trees import training_rows
 
 PENALTIES = np.logspace(-6, 3, 25)
 

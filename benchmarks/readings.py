@@ -5,8 +5,8 @@
 Blocks of later runs (`models.protocols.forward`), all temperature inputs; ridge also with lags of 30 and 120 min. For
 every machine, axis and model the mean and standard deviation over runs of S in µm: free-running, and with one reading a
 shift (the first hour's end) and one an hour, by a random walk of the offset (the last residual is held) and by
-`models.updating`. The second and fourth block are shown apart from the others. The form of the updater was chosen on
-the sample year, the spindle and plants, not on the lathe. Then S by the number of readings, and seconds.
+`models.selection.updating`. The second and fourth block are shown apart from the others. The form of the updater was
+chosen on the sample year, the spindle and plants, not on the lathe. Then S by the number of readings, and seconds.
 
 The sample year and the sample lathe are simulated; the lathe and the spindle are recordings in `--data`, left out where
 that folder is missing; `--plants` adds three drawn plants.
@@ -32,7 +32,7 @@ from features.rises import temperature_inputs
 from models import FAMILIES
 from models.metrics import residual_std_um
 from models.protocols import forward
-from models.updating import COUNTS, SCHEDULES, Track, Updater, out_of_fold, scores
+from models.selection.updating import COUNTS, SCHEDULES, Track, Updater, out_of_fold, scores
 from plants.sample.sample_axis import write_sample_axis
 from thermodrift_exam.plants.plant import draw
 

@@ -17,7 +17,7 @@ from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError, closest
 from features.rises import zeroed_error_um
-from models.updating import Readings
+from models.selection.updating import Readings
 
 HOW = ("lost", "frozen", "stepping")
 STEP_K = 15.0  # of a sensor that steps: a loose plug

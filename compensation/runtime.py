@@ -22,12 +22,12 @@ from compensation.safety import Axis, Limits
 from compensation.substitutes import Guard, Substitutes, Watch
 from data.arrays import Array
 from data.errors import InputError
-from models.conformal import RunBound
+from models.numerics.kernels import scale_of
 from models.program import Program, State
-from models.solvers.kernels import scale_of
-from models.trust import SLACK, Region
-from models.updating import State as Learned
-from models.updating import Updater
+from models.selection.conformal import RunBound
+from models.selection.trust import SLACK, Region
+from models.selection.updating import State as Learned
+from models.selection.updating import Updater
 
 SCHEMA = "thermodrift.compensation/1"
 _ODD_READING_SD = 4.0  # of what the filter expects: beyond it a reading is a failed probing, not thermal error

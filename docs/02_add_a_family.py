@@ -1,7 +1,7 @@
 """2. A family of your own: one class in one file, one line in the registry.
 
-In the project the class would be `models/nearest_batch.py` and the line
-`"nearest_batch": "models.nearest_batch:NearestBatch"` in `models/__init__.py`; here both are made on the spot.
+In the project the class would be `models/families/nearest_batch.py` and the line
+`"nearest_batch": "models.families.nearest_batch:NearestBatch"` in `models/__init__.py`; here both are made on the spot.
 From then on the grid crosses it, the report ranks it and the tests over the registry check it. The same checks run on a
 class that is in no registry: `td.testing.check_family`.
 """
@@ -14,7 +14,7 @@ import numpy as np
 from data.arrays import Array
 from features.design import Design
 from models.base import Family
-from models.solvers.batches import too_few_rows
+from models.numerics.batches import too_few_rows
 
 
 class NearestBatch(Family):
@@ -54,8 +54,8 @@ if __name__ == "__main__":
     import models
     from data.machine import load_machine
     from data.recording import read_batches
-    from models.crossing import Plan
-    from models.grid import run_grid
+    from models.selection.crossing import Plan
+    from models.selection.grid import run_grid
     from plants.sample.sample_year import write_sample_year
     from thermodrift.testing import check_family
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from data.arrays import Array
 from features.grey import synthetic_degree
-from models.result import SCORES
+from models.selection.result import SCORES
 
 SIDE_OF_90 = 1.6449  # standard deviations: a normal value lies within them nine times in ten
 

@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 
 from data.files import source_digest, whole_folder, write_atomic
-from models.crossing import Crossing, FamilyResult
-from models.race import Job
+from models.selection.crossing import Crossing, FamilyResult
+from models.selection.race import Job
 from pipelines.caller import Say
 
 SOURCES = ("data", "features", "models", "twin")

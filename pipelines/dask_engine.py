@@ -18,7 +18,7 @@ from data.endings import ending, without_interrupt
 from data.errors import InputError, WorkError
 from data.files import source_digest
 from data.processes import Shared, one_thread
-from models.grid import Pool
+from models.selection.grid import Pool
 from pipelines.caller import LANES, Done, Say
 from pipelines.checkpoint import LIBRARIES, SOURCES, library_version
 from pipelines.settings import Settings, masked

@@ -28,9 +28,9 @@ from diagnosis.export.machine_file import diagnosed_text, drafted_text
 from diagnosis.findings.schema import Findings, as_json
 from diagnosis.result import Diagnosis
 from models import FAMILIES
-from models.promotion import judged, left_out
 from models.protocols import PromotionRule
-from models.result import GridResult
+from models.selection.promotion import judged, left_out
+from models.selection.result import GridResult
 from pipelines import spool, tracking
 from pipelines.caller import RETRIES, Caller, DirectCaller, Done, Say
 from pipelines.inputs import INPUTS, Inputs

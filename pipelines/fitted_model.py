@@ -20,10 +20,10 @@ from data.machine import parse_machine
 from features.design import Design
 from features.rises import zeroed_error_um
 from models.base import Family
-from models.conformal import RunBound
-from models.crossing import unfitted, with_target
-from models.trust import Region
-from models.updating import Updater, left_out_tracks, out_of_fold
+from models.selection.conformal import RunBound
+from models.selection.crossing import unfitted, with_target
+from models.selection.trust import Region
+from models.selection.updating import Updater, left_out_tracks, out_of_fold
 from pipelines import model_store
 
 

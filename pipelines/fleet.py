@@ -123,7 +123,7 @@ class _Training(_Part):
     @field_validator("effort")
     @classmethod
     def _known_effort(cls, value: str) -> str:
-        from models.crossing import FINALISTS  # what only waits loads no numpy
+        from models.selection.crossing import FINALISTS  # what only waits loads no numpy
 
         return _known((value,), tuple(FINALISTS))[0]
 

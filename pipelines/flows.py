@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from data.errors import InputError, WorkError
 from data.machine import load_machine
-from models.grid import Pools, local_pools
+from models.selection.grid import Pools, local_pools
 from pipelines.caller import LANES, Done, Say, counted, label
 from pipelines.diagnosing import DiagnosisRequest, dated_folder, diagnose_file
 from pipelines.request import TrainRequest

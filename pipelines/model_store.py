@@ -25,9 +25,9 @@ from data.batch import Batch
 from data.errors import InputError, one_of
 from data.machine import Machine, parse_machine
 from models.base import Family, family_from_plain
-from models.conformal import RunBound
-from models.trust import SLACK, Region, disagreement_um, farthest, watched
-from models.updating import Updater
+from models.selection.conformal import RunBound
+from models.selection.trust import SLACK, Region, disagreement_um, farthest, watched
+from models.selection.updating import Updater
 from pipelines.audit import CHAMPION
 
 SCHEMA = "thermodrift.model/3"

@@ -18,7 +18,7 @@ import pandas as pd
 from mlflow.pyfunc import PythonModel, PythonModelContext
 
 SERVED = ("serving.json", "model.onnx", "region.onnx")  # only of families that are programs
-_SLACK = 0.05  # of a region's width, as in models.trust
+_SLACK = 0.05  # of a region's width, as in models.selection.trust
 
 
 class CompensationModel(PythonModel):

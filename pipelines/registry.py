@@ -31,12 +31,12 @@ from data.batch import Batch
 from data.errors import InputError, closest, one_of
 from features.rises import zeroed_error_um
 from models.base import Family
-from models.conformal import RunBound
 from models.metrics import residual_std_um
-from models.outlook import Outlook, outlook
-from models.promotion import Choice, Comparison, compare_paired, left_out
-from models.result import GridResult
-from models.trust import Region
+from models.selection.conformal import RunBound
+from models.selection.outlook import Outlook, outlook
+from models.selection.promotion import Choice, Comparison, compare_paired, left_out
+from models.selection.result import GridResult
+from models.selection.trust import Region
 from pipelines import audit, fitted_model, model_store, pyfunc_model, store
 from pipelines.audit import CHAMPION, PROVISIONAL
 from pipelines.runs import (

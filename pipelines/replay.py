@@ -36,9 +36,9 @@ from data.lakefile import content_digest, encode, safe_name
 from data.machine import Machine
 from data.recording import read_batches, recording_files
 from features.rises import zeroed_error_um
-from models.crossing import Plan
 from models.metrics import residual_std_um
-from models.replay import Arrival, Replay, Retraining, Run, arrivals
+from models.selection.crossing import Plan
+from models.selection.replay import Arrival, Replay, Retraining, Run, arrivals
 from pipelines import model_store, registry, tracking
 from pipelines.audit import CHAMPION
 from pipelines.caller import Caller, Done, Say
@@ -393,7 +393,7 @@ def deliver(arrival: Arrival, recording: Recording, machine: Machine, inbox: Pat
 
 
 def faulty(batch: Batch, fault: str) -> Batch:
-    """The batch with one of `models.replay.FAULTS` that leaves something to read."""
+    """The batch with one of `models.selection.replay.FAULTS` that leaves something to read."""
     table = batch.table.copy()
     third = max(1, len(table) // 3)
     if fault == "cut":

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from data.errors import InputError, check_suffix, closest
 from data.machine import Machine, load_machine
-from models.crossing import Plan
 from models.protocols import PROTOCOLS
+from models.selection.crossing import Plan
 from pipelines.settings import Settings
 
 REPORT_SUFFIXES = (".html", ".md")

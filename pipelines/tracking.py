@@ -33,10 +33,10 @@ from sqlalchemy.exc import SQLAlchemyError
 from data.batch import Batch
 from data.errors import InputError, WorkError, place_of
 from models import FAMILIES
-from models.outlook import outlook
-from models.promotion import Choice, choose, judged
 from models.protocols import PromotionRule
-from models.result import GridResult, Training
+from models.selection.outlook import outlook
+from models.selection.promotion import Choice, choose, judged
+from models.selection.result import GridResult, Training
 from pipelines import store
 from pipelines.audit import CHAMPION
 from pipelines.caller import Say

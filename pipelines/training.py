@@ -23,14 +23,14 @@ from data.checks import check_machine
 from data.errors import InputError, WorkError, place_of
 from data.ingest import IngestReport, ingest
 from data.machine import Machine, load_machine
-from models import promotion
-from models.crossing import Crossing, FamilyResult, Plan, prepare, refit, unfitted, with_target
-from models.grid import Pools, Workers, assemble, local_pools, workers_for
-from models.outlook import Outlook, outlook
-from models.race import Job, Raced, drive
-from models.result import GridResult, Training
-from models.trust import Region, left_out_runs
-from models.updating import updated_scores
+from models.selection import promotion
+from models.selection.crossing import Crossing, FamilyResult, Plan, prepare, refit, unfitted, with_target
+from models.selection.grid import Pools, Workers, assemble, local_pools, workers_for
+from models.selection.outlook import Outlook, outlook
+from models.selection.race import Job, Raced, drive
+from models.selection.result import GridResult, Training
+from models.selection.trust import Region, left_out_runs
+from models.selection.updating import updated_scores
 from pipelines import registry, spool, stopping, tracking
 from pipelines.caller import RETRIES, Caller, Say
 from pipelines.checkpoint import Checkpoint

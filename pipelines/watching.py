@@ -218,7 +218,7 @@ def _channel(
 
 def _run(batch: Batch, c: Champion, model: StoredModel | None, ids: set[str], last_seen: str) -> dict[str, Any]:
     """One run: how far outside, and the error of the champion where it is newer than the training."""
-    from models.trust import SLACK, farthest, watched
+    from models.selection.trust import SLACK, farthest, watched
 
     start = _date(batch.start)
     newer = bool(ids) and batch.batch_id not in ids and (not start or not last_seen or start > last_seen)

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from models.replay import Paired, Replay, Retraining, Run, Score
+from models.selection.replay import Paired, Replay, Retraining, Run, Score
 from reports.drawing import LINES, MUTED, WIDTH_IN, panel
 from reports.labels import GREEN, NOTHING, count, number
 from reports.layout import Column, Key, Number, Numbers, Page, Panel, Plot, Row, Section, Table, Text

@@ -37,6 +37,7 @@ EXAM: Mapping[str, set[str]] = {  # a distribution of its own, which no room of 
     },
 }  # fmt: skip
 EVERY = {**ALLOWED, **EXAM}
+FOLDERS: Mapping[str, tuple[str, ...]] = {"models": ("numerics", "families", "selection")}  # each may use those before
 ORCHESTRATION = {"prefect", "mlflow", "typer"}
 PLANTS = {"plants", "thermodrift_exam.plants"}
 PLANTS_MAY_USE = {"data", *PLANTS, "numpy", "scipy", "pandas", "yaml", "skfem"}
@@ -101,6 +102,19 @@ def test_only_pipelines_imports_what_orchestrates_and_tracks() -> None:
         for name, others in graph().items()
         for other in others
         if other.split(".")[0] in ORCHESTRATION and not name.startswith(("pipelines", "thermodrift_exam.commands"))
+    ]
+    assert not wrong
+
+
+def test_no_arrow_points_upwards_inside_a_room() -> None:
+    order = {f"{room}.{folder}": i for room, folders in FOLDERS.items() for i, folder in enumerate(folders)}
+    stands = {name: ".".join(name.split(".")[:2]) for name in MODULES}
+    wrong = [
+        (name, other)
+        for name, others in graph().items()
+        for other in others
+        if (here := stands[name]) in order and (there := stands.get(other)) in order and room_of(name) == room_of(other)
+        if order[here] < order[str(there)]
     ]
     assert not wrong
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from data.machine import load_machine
     from features.selectors import SELECTORS
     from models import FAMILIES
-    from models.crossing import Plan
+    from models.selection.crossing import Plan
     from thermodrift.api import (
         calibrate,
         cross,
@@ -49,7 +49,7 @@ __all__ = [
 ]  # fmt: skip
 _MODULES = {
     "CalibrationOptions": "twin.calibration", "FAMILIES": "models", "Lake": "data.lake",
-    "MECHANISMS": "twin.mechanisms", "Plan": "models.crossing", "SELECTORS": "features.selectors",
+    "MECHANISMS": "twin.mechanisms", "Plan": "models.selection.crossing", "SELECTORS": "features.selectors",
     "load_machine": "data.machine",
 }  # fmt: skip
 _ROOMS = (

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from data.lake import Lake
     from diagnosis.result import Diagnosis
     from models.base import Family
-    from models.crossing import Plan
-    from models.replay import Replay
-    from models.result import GridResult
+    from models.selection.crossing import Plan
+    from models.selection.replay import Replay
+    from models.selection.result import GridResult
     from pipelines.commands.simulate import Simulated
     from pipelines.model_store import StoredModel
     from pipelines.training import TrainOutcome
@@ -107,7 +107,7 @@ def train(
         InputError: a file, channel or plan that cannot be used, or too few batches.
         WorkError: lake or tracking store do not answer.
     """
-    from models.crossing import Plan
+    from models.selection.crossing import Plan
     from pipelines import settings, training
     from pipelines.caller import DirectCaller
     from pipelines.request import TrainRequest
@@ -141,8 +141,8 @@ def cross(
     Raises:
         InputError: an unknown channel, selector or family, or too few batches.
     """
-    from models.crossing import Plan
-    from models.grid import run_grid
+    from models.selection.crossing import Plan
+    from models.selection.grid import run_grid
     from pipelines.request import error_channels
 
     known = _machine(machine)
@@ -158,7 +158,7 @@ def leaderboard(result: GridResult, protocol: str = "") -> pd.DataFrame:
     Args:
         result: one channel of `cross` or of ``train(…).results``.
         protocol: how the cells are judged; default: by the expected loss in a future run
-            (`models.promotion`).
+            (`models.selection.promotion`).
 
     Returns:
         family, selector, n_tsp, score_um, S_mean_um, S_std_um, max_abs_um (µm), inputs ("|"-joined), and the leading
@@ -167,8 +167,8 @@ def leaderboard(result: GridResult, protocol: str = "") -> pd.DataFrame:
     Raises:
         InputError: a protocol that is unknown or was not run.
     """
-    from models.promotion import ranked
     from models.protocols import PROTOCOLS, PromotionRule
+    from models.selection.promotion import ranked
 
     if protocol and protocol not in PROTOCOLS:
         raise InputError(f"unknown protocol {protocol!r}: {closest(protocol, PROTOCOLS)}")
@@ -311,7 +311,7 @@ def replay(
         InputError: a file, channel or plan that cannot be used, too few runs, or `out` holds something else.
         WorkError: `out` cannot be written.
     """
-    from models.crossing import Plan
+    from models.selection.crossing import Plan
     from pipelines.commands.replay import replay_year
     from pipelines.replay import ReplayRequest
 

@@ -18,7 +18,7 @@ from compensation.safety import Limits
 from data.errors import InputError
 from data.files import check_folder, staged
 from models.program import Program
-from models.trust import LEAST_WIDTH
+from models.selection.trust import LEAST_WIDTH
 
 SIGN = (
     "The model gives the error in um. The control adds the negative of the error: offset_um = -error_um, limited in "
@@ -78,7 +78,8 @@ class AxisModel:
         """Least and greatest value of each channel with which the correction acts; ±inf for one without any.
 
         A value further outside the trained region than the region is wide counts as a fault of the sensor: up to there
-        the model extrapolates, as it does in `models.trust`. Narrow regions count as 5 K, 1000 rpm or 1000 mm/min wide.
+        the model extrapolates, as it does in `models.selection.trust`. Narrow regions count as 5 K, 1000 rpm or 1000
+        mm/min wide.
         """
         out = []
         for name, unit in zip(self.program.channels, self.program.units, strict=True):

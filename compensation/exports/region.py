@@ -11,7 +11,7 @@ from compensation.runtime import AxisModel
 from data.arrays import Array
 from data.batch import Channel
 from models.program import Builder, Program
-from models.trust import SLACK
+from models.selection.trust import SLACK
 
 
 def trust_program(a: AxisModel, known: Mapping[str, Channel]) -> Program | None:

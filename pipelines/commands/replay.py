@@ -13,7 +13,7 @@ from pipelines.caller import Done, Say
 from pipelines.options import Json, MachineFile, split
 
 if TYPE_CHECKING:
-    from models.replay import Replay, Retraining, Score
+    from models.selection.replay import Replay, Retraining, Score
     from pipelines.replay import ReplayRequest
 
 
@@ -93,7 +93,7 @@ def replay(
     Shows what each retraining was worth against a model that is never retrained and against none. The same command
     goes on where it was stopped.
     """
-    from models.crossing import FINALISTS, Plan
+    from models.selection.crossing import FINALISTS, Plan
     from pipelines.replay import ReplayRequest
 
     plan = Plan(effort=one_of(effort, FINALISTS, "--effort"))

@@ -138,8 +138,8 @@ def train(
     settings.configure_environment()
     from features.selectors import SELECTORS
     from models import FAMILIES
-    from models.crossing import FINALISTS, Plan
     from models.protocols import PROTOCOLS
+    from models.selection.crossing import FINALISTS, Plan
     from pipelines.engine import ENGINES, open_engine
     from pipelines.request import TrainRequest, check_request
 

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pandas as pd
 
-from models.conformal import RunBound
-from models.promotion import Choice
-from models.result import CELL_KEYS, GridResult
-from models.trust import SLACK
+from models.selection.conformal import RunBound
+from models.selection.promotion import Choice
+from models.selection.result import CELL_KEYS, GridResult
+from models.selection.trust import SLACK
 from reports.comparison.figures import Cloud, S_against_S
 from reports.comparison.tables import S_by_batch, best_per
 from reports.labels import (
@@ -125,7 +125,7 @@ def bound_panel(name: str, left_out: pd.DataFrame, simulated: bool) -> Panel | N
     """S of every left-out run over the S expected from its inputs, with the bound; None where nobody measured it.
 
     Args:
-        left_out: of `models.trust.left_out_runs`.
+        left_out: of `models.selection.trust.left_out_runs`.
     """
     expected = _expected(left_out)
     if expected is None:

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from models.promotion import Choice, compare_paired, left_out
 from models.protocols import PromotionRule
-from models.result import GridResult, Training
+from models.selection.promotion import Choice, compare_paired, left_out
+from models.selection.result import GridResult, Training
 from reports.comparison import figures, tables
 from reports.comparison import story as records
 from reports.comparison.certainty import bound_panel, bound_table, certainty_table, diagnostics_table

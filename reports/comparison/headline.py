@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from models.outlook import Outlook, outlook
-from models.promotion import Choice
-from models.result import GridResult, Training
+from models.selection.outlook import Outlook, outlook
+from models.selection.promotion import Choice
+from models.selection.result import GridResult, Training
 from reports.comparison.story import Verdict
 from reports.comparison.tables import group_order
 from reports.labels import NOTHING, cell_label, count, number, percent, plus_minus, sentence

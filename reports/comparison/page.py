@@ -14,7 +14,7 @@ from data.registry import Registry
 from features.selectors import SELECTORS
 from models import FAMILIES
 from models.protocols import PromotionRule
-from models.result import GridResult, Training
+from models.selection.result import GridResult, Training
 from reports.comparison import story as records
 from reports.comparison.channel import channel_part
 from reports.comparison.headline import overview

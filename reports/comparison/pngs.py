@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 
-from models.promotion import choose
 from models.protocols import PromotionRule
-from models.result import GridResult
+from models.selection.promotion import choose
+from models.selection.result import GridResult
 from reports.comparison import figures
 from reports.comparison.tables import best_per, left_out_batches, paths, protocols_of, scored, zero_um
 from reports.drawing import picture_bytes

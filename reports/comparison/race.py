@@ -8,17 +8,17 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from models.loss import BASELINES
-from models.promotion import Choice, ranked
 from models.protocols import PromotionRule
-from models.result import GridResult
+from models.selection.loss import BASELINES
+from models.selection.promotion import Choice, ranked
+from models.selection.result import GridResult
 from reports.comparison.figures import logarithmic, say_simulated
 from reports.drawing import GREY, MUTED, panel
 from reports.labels import BLUE, INK, NOTHING, cell_label, family_label, number, plus_minus
 from reports.layout import Column, Key, Panel, Plot, Row, Scale, Table
 
 _SHOWN = 9  # families in the figure
-_ROUNDS = {"families": "1 families", "points": "2 points", "runs": "3 runs"}  # of `models.race`
+_ROUNDS = {"families": "1 families", "points": "2 points", "runs": "3 runs"}  # of `models.selection.race`
 
 
 def why_panel(name: str, result: GridResult, choice: Choice, rule: PromotionRule, digits: int) -> Panel | None:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import pandas as pd
 from matplotlib.figure import Figure
 
-from models.result import GridResult
-from models.updating import COUNTS
+from models.selection.result import GridResult
+from models.selection.updating import COUNTS
 from reports.comparison.figures import HALF_IN, axes_in, say_simulated
 from reports.drawing import MUTED
 from reports.labels import BLUE, NOTHING, count, percent, plus_minus
 from reports.layout import Column, Key, Panel, Plot, Row, Table
 
-_LABELS = {  # of `models.updating.SCHEDULES`
+_LABELS = {  # of `models.selection.updating.SCHEDULES`
     "one a shift": "one, after the first hour",
     "one reading an hour": "one an hour",
 }

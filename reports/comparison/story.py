@@ -12,9 +12,9 @@ import numpy as np
 import pandas as pd
 
 from data.errors import InputError
-from models.promotion import Choice, choose, decide, pick
 from models.protocols import PromotionRule
-from models.result import GridResult, Training
+from models.selection.promotion import Choice, choose, decide, pick
+from models.selection.result import GridResult, Training
 from reports.comparison.tables import protocols_of
 from reports.labels import between, cell_label, count, decimals, family_label, number, p_label, plus_minus
 from reports.layout import Column, Row, Table

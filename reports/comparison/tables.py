@@ -12,9 +12,9 @@ import pandas as pd
 
 from data.arrays import Array
 from features.stability import tsp_frequency
-from models.promotion import BASELINES, Choice
 from models.protocols import PROTOCOLS
-from models.result import CELL_KEYS, GridResult
+from models.selection.promotion import BASELINES, Choice
+from models.selection.result import CELL_KEYS, GridResult
 from reports.labels import NOTHING, cell_label, count, family_label, listed, number, percent, selector_label
 from reports.layout import Column, Row, Scale, Shade, Strip, Table
 

@@ -23,8 +23,8 @@ from compensation.exports.region import trust_program
 from compensation.safety import Limits
 from data.batch import Channel
 from features.rises import feature
-from models.conformal import RunBound
 from models.program import Builder, replay
+from models.selection.conformal import RunBound
 from tests.conftest import make_toy_batches
 from thermodrift.testing.exports import export_of, offset_only, straight
 

@@ -20,10 +20,10 @@ from data.batch import Batch
 from data.errors import InputError
 from features.design import Design
 from models import FAMILIES
-from models.conformal import RunBound
 from models.program import Builder, replay
-from models.trust import Region, watched
-from models.updating import Updater, out_of_fold
+from models.selection.conformal import RunBound
+from models.selection.trust import Region, watched
+from models.selection.updating import Updater, out_of_fold
 from tests.conftest import make_toy_batches
 
 QUICK = Limits(rate_um_per_s=10.0, step_um=1e6, warm_up_s=0.0, stale_s=1000.0, max_offset_um=500.0)

@@ -32,8 +32,8 @@ from diagnosis.diagnose import diagnose
 from diagnosis.findings.schema import as_json
 from evidence.sealing.examinee import read_case
 from models import FAMILIES
-from models.crossing import Plan
-from models.grid import run_grid
+from models.selection.crossing import Plan
+from models.selection.grid import run_grid
 from plants.sample.sample_year import write_sample_year
 from thermodrift_exam.proof.spec import CaseSpec
 from thermodrift_exam.proof.suite import build, small_suite, write_built

@@ -13,10 +13,10 @@ from data.errors import InputError
 from data.machine import parse_machine
 from features.design import Design
 from models import FAMILIES
-from models.axis_coupled import AxisCoupled
-from models.baselines import MeanCurve
-from models.crossing import Plan, prepare
-from models.grid import run_grid
+from models.families.axis_coupled import AxisCoupled
+from models.families.baselines import MeanCurve
+from models.selection.crossing import Plan, prepare
+from models.selection.grid import run_grid
 
 INPUTS = ("room", "spindle", "nut", "bed")
 AT_MM = np.array([-500.0, -240.0, 20.0])

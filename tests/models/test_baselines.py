@@ -5,7 +5,7 @@ import pytest
 
 from data.errors import InputError
 from features.design import Design
-from models.baselines import MeanCurve, Zero
+from models.families.baselines import MeanCurve, Zero
 
 
 def make_design(runs: list[list[float]], time_s: list[list[float]] | None = None) -> Design:

@@ -10,8 +10,8 @@ from threadpoolctl import threadpool_limits
 from features.design import Design
 from features.levenberg_marquardt import jacobian, outputs, train
 from features.nets import Nets
-from models.bp import BP, TRANSFERS, BPLinear
-from models.mlr import MLR
+from models.families.bp import BP, TRANSFERS, BPLinear
+from models.families.mlr import MLR
 
 
 def make_design(seed=0, sizes=(40, 25, 33, 30), p=2, law=None, ambient=None) -> Design:
@@ -103,7 +103,7 @@ def test_recovers_a_net_of_its_own_shape():
 def test_small_stacks_give_what_one_stack_gives(monkeypatch):
     design, folds = make_design(), [[0, 1, 2], [1, 2, 3], [0, 2, 3]]
     want = BP().as_published().fit_folds(design, folds)
-    monkeypatch.setattr("models.bp._STACK_VALUES", 1)
+    monkeypatch.setattr("models.families.bp._STACK_VALUES", 1)
     for a, b in zip(want, BP().as_published().fit_folds(design, folds), strict=True):
         np.testing.assert_allclose(a.predict_design(design, [3])[0], b.predict_design(design, [3])[0], atol=1e-6)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from models.conformal import LEVEL, RunBound, expected_next
+from models.selection.conformal import LEVEL, RunBound, expected_next
 
 
 def left_out(S_um: np.ndarray, protocol: str = "forward", **columns: np.ndarray) -> pd.DataFrame:

@@ -9,7 +9,7 @@ import pytest
 from data.batch import Batch, Channel
 from features.design import Design
 from features.rises import first_order_lag
-from models.distributed_lag import (
+from models.families.distributed_lag import (
     CRITERIA,
     KOYCK_TAUS_S,
     RIDGES,
@@ -19,8 +19,8 @@ from models.distributed_lag import (
     koyck_shapes,
     lag_shapes,
 )
-from models.linear import Task
-from models.solvers.lags import lag_responses
+from models.families.linear import Task
+from models.numerics.lags import lag_responses
 from thermodrift.testing.runs import stack
 
 SIZES = (60, 45, 52, 40, 57)

@@ -8,8 +8,8 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import ElasticNet as SkElasticNet
 
 from features.design import Design
-from models.elastic_net import ElasticNet, sparse_coefficients
-from models.linear import Blocks
+from models.families.elastic_net import ElasticNet, sparse_coefficients
+from models.families.linear import Blocks
 from thermodrift.testing.runs import stack
 
 K, N, P = 6, 40, 6

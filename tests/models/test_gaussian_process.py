@@ -9,10 +9,10 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, Wh
 
 from data.errors import InputError
 from features.design import Design
-from models import gaussian_process
-from models.gaussian_process import GaussianProcess, Setting
-from models.solvers.batch_process import LeftOut
-from models.solvers.kernels import products
+from models.families import gaussian_process
+from models.families.gaussian_process import GaussianProcess, Setting
+from models.numerics.batch_process import LeftOut
+from models.numerics.kernels import products
 
 NOISE_UM, OWN_SLOPE_UM_PER_K = 0.5, 0.25
 

@@ -7,7 +7,7 @@ import pytest
 
 from data.errors import InputError
 from features.design import Design
-from models.gm1n import GM1N, response
+from models.families.gm1n import GM1N, response
 
 
 def make_design(x, y, sizes, step_s=60.0, inputs=None) -> Design:

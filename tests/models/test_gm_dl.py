@@ -8,10 +8,10 @@ import pytest
 
 from data.batch import Batch, Channel
 from features.design import Design
-from models.distributed_lag import DistributedLag
-from models.gm1n import GM1N
-from models.gm_dl import GMDL, band_weights, bands_of, start_temperatures_degC
-from models.solvers.grey_models import grey_layers, layer_design
+from models.families.distributed_lag import DistributedLag
+from models.families.gm1n import GM1N
+from models.families.gm_dl import GMDL, band_weights, bands_of, start_temperatures_degC
+from models.families.grey_models import grey_layers, layer_design
 
 STARTS_DEGC = (4.0, 31.0, 12.0, 5.0, 19.0, 30.0, 20.0, 6.0, 18.0, 29.0, 21.0, 13.0)
 INPUTS = ("head", "bed")

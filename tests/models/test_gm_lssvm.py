@@ -7,9 +7,9 @@ import pytest
 
 from data.errors import InputError
 from features.design import Design
-from models.gm1n import GM1N, response
-from models.gm_lssvm import GMLSSVM
-from models.solvers.grey_models import grey_layers, layer_design, sequence_outputs
+from models.families.gm1n import GM1N, response
+from models.families.gm_lssvm import GMLSSVM
+from models.families.grey_models import grey_layers, layer_design, sequence_outputs
 
 SIZES = (70, 55, 62, 58, 66)
 

@@ -9,10 +9,10 @@ import pytest
 from data.errors import InputError
 from features.selectors import SELECTORS
 from models import FAMILIES
-from models.crossing import Plan, prepare, refit
-from models.grid import run_grid
 from models.metrics import residual_std_um
-from models.result import CELL_KEYS, GridResult
+from models.selection.crossing import Plan, prepare, refit
+from models.selection.grid import run_grid
+from models.selection.result import CELL_KEYS, GridResult
 
 QUICK = Plan(families=("zero", "mlr", "ridge"), selectors=("none", "correlation", "pca_elimination"))
 

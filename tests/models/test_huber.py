@@ -8,8 +8,8 @@ from scipy.optimize import minimize
 from sklearn.linear_model import HuberRegressor
 
 from features.design import Design
-from models.huber import Huber, settle
-from models.mlr import MLR
+from models.families.huber import Huber, settle
+from models.families.mlr import MLR
 from thermodrift.testing.runs import stack
 
 K, N, P = 6, 50, 4

@@ -10,10 +10,10 @@ from data.batch import Batch, Channel
 from data.errors import InputError
 from features.design import Design
 from features.rises import first_order_lag
-from models.lag_dictionary import Columns, LagDictionary
+from models.families.lag_dictionary import Columns, LagDictionary
+from models.families.ridge import Ridge
 from models.metrics import residual_std_um
-from models.ridge import Ridge
-from models.solvers.batch_process import BatchProcess, ByColumns, ByRows, Windows
+from models.numerics.batch_process import BatchProcess, ByColumns, ByRows, Windows
 
 STEP_S, N = 300.0, 72
 INPUTS = ("nose", "bed")

@@ -9,10 +9,10 @@ from data.errors import InputError
 from features.design import Design
 from models import FAMILIES
 from models.base import Family
-from models.linear import mean_square
-from models.mlr import MLR
-from models.pcr import PCR
-from models.ridge import Ridge
+from models.families.linear import mean_square
+from models.families.mlr import MLR
+from models.families.pcr import PCR
+from models.families.ridge import Ridge
 from thermodrift.testing.runs import stack
 
 NOISE_UM = 0.5

@@ -13,12 +13,12 @@ from sklearn.preprocessing import StandardScaler
 
 from features.design import Design
 from models.base import inner_groups
-from models.elastic_net import ElasticNet
-from models.huber import Huber
-from models.mlr import MLR
-from models.pcr import PCR, PCRByLeaveBatchOut
-from models.pls import PLS
-from models.ridge import Ridge
+from models.families.elastic_net import ElasticNet
+from models.families.huber import Huber
+from models.families.mlr import MLR
+from models.families.pcr import PCR, PCRByLeaveBatchOut
+from models.families.pls import PLS
+from models.families.ridge import Ridge
 from thermodrift.testing.runs import stack
 
 LINEAR = [MLR, Ridge, PCR, PCRByLeaveBatchOut, PLS]
@@ -256,7 +256,7 @@ def test_an_error_that_never_moves_or_inputs_that_never_move_give_the_mean(cls):
 def test_chunked_and_whole_choice_agree(monkeypatch):
     design = make_design(6)
     whole = PLS().as_published().fit_folds(design, FOLDS)
-    monkeypatch.setattr("models.solvers.pooled_sums.AT_ONCE", 5 * P * P)
+    monkeypatch.setattr("models.numerics.pooled_sums.AT_ONCE", 5 * P * P)
     for one, other in zip(whole, PLS().as_published().fit_folds(design, FOLDS), strict=True):
         assert one.fitted["n_components"] == other.fitted["n_components"]
         near(one.fitted["coef_um_per_K"], other.fitted["coef_um_per_K"])

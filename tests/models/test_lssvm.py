@@ -8,9 +8,9 @@ from sklearn.kernel_ridge import KernelRidge
 
 from data.errors import InputError
 from features.design import Design
-from models.lssvm import LSSVM
-from models.solvers import kernels as bordered
-from models.solvers.kernels import Bordered, Kernel, kernel
+from models.families.lssvm import LSSVM
+from models.numerics import kernels as bordered
+from models.numerics.kernels import Bordered, Kernel, kernel
 
 SIZES = (14, 9, 12, 11, 13)
 SMALL = {"sigmas": (0.5, 2.0), "gammas": (1.0, 100.0)}

@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from models.outlook import outlook
-from models.promotion import pick
 from models.protocols import PromotionRule
-from models.result import GridResult
+from models.selection.outlook import outlook
+from models.selection.promotion import pick
+from models.selection.result import GridResult
 from tests.toys.training import toy_batches, toy_result
 
 RULE = PromotionRule()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from models.solvers.particle_swarm import least
+from models.numerics.particle_swarm import least
 
 BOX = np.array([-3.0, -2.0]), np.array([4.0, 5.0])
 

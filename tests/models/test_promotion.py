@@ -9,10 +9,10 @@ import pytest
 from scipy import stats
 
 from data.errors import InputError
-from models import promotion
-from models.promotion import choose, compare_paired, left_out, pick, sign_flip_p
 from models.protocols import PromotionRule
-from models.result import GridResult
+from models.selection import promotion
+from models.selection.promotion import choose, compare_paired, left_out, pick, sign_flip_p
+from models.selection.result import GridResult
 from tests.toys.training import toy_batches, toy_result
 
 RULE = PromotionRule(record_runs=0)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from data.errors import InputError
-from models.crossing import Plan, prepare, refit
-from models.grid import run_grid
-from models.loss import cost_of_choosing, paired, pooled
-from models.promotion import choose
 from models.protocols import PromotionRule
-from models.race import rounds
-from models.stack import Stack, weights_of
+from models.selection.crossing import Plan, prepare, refit
+from models.selection.grid import run_grid
+from models.selection.loss import cost_of_choosing, paired, pooled
+from models.selection.promotion import choose
+from models.selection.race import rounds
+from models.selection.stack import Stack, weights_of
 
 FAMILIES = ("zero", "mean_curve", "mlr", "ridge", "pls", "huber", "distributed_lag", "stack")
 PLAN = Plan(families=FAMILIES, effort="quick")

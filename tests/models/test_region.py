@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.trust import PATTERN, Region, watched
+from models.selection.trust import PATTERN, Region, watched
 
 
 def test_training_batches_are_inside_their_own_region(toy_batches) -> None:

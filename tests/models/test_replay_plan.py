@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from models.replay import Paired, Replay, Retraining, Run, arrivals
+from models.selection.replay import Paired, Replay, Retraining, Run, arrivals
 
 IDS = [f"b{k:02d}" for k in range(30)]
 RUN = Run("z", "b", "2025-01-01T08:00", 1, "as recorded", 1, 1, 2.0, 3.0, 9.0, 2.0, 2.5)

@@ -4,9 +4,9 @@ import pandas as pd
 import pytest
 
 from features.selectors import SELECTORS
-from models.crossing import Plan
-from models.grid import run_grid
-from models.result import GridResult
+from models.selection.crossing import Plan
+from models.selection.grid import run_grid
+from models.selection.result import GridResult
 
 CROSSED = ("none", "correlation", "fuzzy_correlation", "vif_pruning", "exhaustive")
 

@@ -9,11 +9,11 @@ import torch
 from data.errors import InputError
 from features.design import Design
 from features.rises import first_order_lag
-from models.mlr import MLR
-from models.recurrent import GRU, LSTM
-from models.solvers.sequences import Stack
-from models.solvers.torch_training import Rows, loss_slopes, train
-from models.tcn import LAYERS, TCN
+from models.families.mlr import MLR
+from models.families.recurrent import GRU, LSTM
+from models.families.tcn import LAYERS, TCN
+from models.numerics.sequences import Stack
+from models.numerics.torch_training import Rows, loss_slopes, train
 
 NETS = {"lstm": LSTM, "gru": GRU, "tcn": TCN}
 STEP_S = 300.0
@@ -287,7 +287,7 @@ def test_small_stacks_give_what_one_stack_gives(Net, monkeypatch):
     design, folds = plant(bent_law), [[0, 1, 2, 3], [1, 2, 3, 4], [0, 2, 5]]
     want = Net(epochs=5).fit_folds(design, folds)
     told = Net().predict_folds(design, want, [[6], [7], [6]])
-    monkeypatch.setattr("models.solvers.sequence_net._STACK_VALUES", 1)
+    monkeypatch.setattr("models.families.sequence_net._STACK_VALUES", 1)
     again = Net(epochs=5).fit_folds(design, folds)
     for a, b in zip(told, Net().predict_folds(design, again, [[6], [7], [6]]), strict=True):
         np.testing.assert_allclose(a[0], b[0], atol=1e-7)
@@ -295,7 +295,7 @@ def test_small_stacks_give_what_one_stack_gives(Net, monkeypatch):
 
 @pytest.mark.parametrize("waiting", [1, 10_000_000])
 def test_subsets_together_are_each_alone_and_one_that_fails_keeps_the_others(Net, waiting, monkeypatch):
-    monkeypatch.setattr("models.solvers.sequence_net._WAITING_VALUES", waiting)
+    monkeypatch.setattr("models.families.sequence_net._WAITING_VALUES", waiting)
     design = plant(bent_law)
     designs = [design.subset(names) for names in (("a",), ("b",), ("a", "b"), ("b", "a"))]
     folds = [[[0, 1, 2, 3], [4]], [[]], [[1, 2, 3]], [[0, 1, 2, 3], [2, 3, 4, 5, 6, 7]]]

@@ -7,7 +7,8 @@ import pytest
 
 from features.design import Design
 from features.rises import first_order_lag
-from models.solvers.sequences import LAG_STEPS, Sequences, Stack, fit_memories, memory_columns, strides
+from models.families.sequence_net import fit_memories
+from models.numerics.sequences import LAG_STEPS, Sequences, Stack, memory_columns, strides
 
 
 def make_design(sizes=(7, 5), p=2, step_s=60.0, seed=0, **more) -> Design:

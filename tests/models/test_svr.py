@@ -5,7 +5,7 @@ import pytest
 from sklearn.svm import SVR as LibSVR
 
 from features.design import Design
-from models.svr import SVR
+from models.families.svr import SVR
 
 ONE = {"sigmas": (1.0,), "costs": (2e3,), "epsilons": (0.05,)}
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from features.design import Design
-from models.solvers.lags import behind
-from models.thermal_exponential import ThermalExponential
+from models.families.thermal_exponential import ThermalExponential
+from models.numerics.lags import behind
 from thermodrift.testing.runs import stack
 
 

@@ -9,11 +9,11 @@ from scipy.signal import cont2discrete, lti
 
 from data.batch import Batch, Channel
 from features.design import Design
+from models.families.ridge import Ridge
+from models.families.transfer_function import TAUS_S, Dictionary, Source, TransferFunction, combination
 from models.metrics import residual_std_um
-from models.ridge import Ridge
-from models.solvers.batches import only
-from models.solvers.lags import lag_responses
-from models.transfer_function import TAUS_S, Dictionary, Source, TransferFunction, combination
+from models.numerics.batches import only
+from models.numerics.lags import lag_responses
 
 STEP_S = 120.0
 CHANNELS = {

@@ -9,9 +9,9 @@ from sklearn.tree import DecisionTreeRegressor
 
 from features.design import Design
 from models.base import Family
-from models.hist_gradient_boosting import HistGradientBoosting
-from models.random_forest import RandomForest
-from models.solvers.trees import Trees, training_rows
+from models.families.hist_gradient_boosting import HistGradientBoosting
+from models.families.random_forest import RandomForest
+from models.numerics.trees import Trees, training_rows
 
 
 def make_design(batches: int = 8, rows: int = 30, noise_um: float = 0.5, own_um: float = 0.0, seed: int = 0) -> Design:

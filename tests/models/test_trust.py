@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from models.crossing import Plan, cross_family
-from models.grid import run_grid
-from models.judging import KEPT
-from models.trust import COLUMNS, disagreement_um, left_out_runs
+from models.selection.crossing import Plan, cross_family
+from models.selection.grid import run_grid
+from models.selection.judging import KEPT
+from models.selection.trust import COLUMNS, disagreement_um, left_out_runs
 
 CELL = ("correlation", "ridge", 2)
 

@@ -13,12 +13,12 @@ from data.errors import InputError
 from features.design import Design
 from models import FAMILIES
 from models.base import Family, family_from_plain
-from models.crossing import Plan, cross_family, prepare
-from models.race import Job, in_order
-from models.solvers.twin_folds import Calibrations, TwinRun, _thinned
-from models.twin import Twin
-from models.twin_kalman import TwinKalman
-from models.twin_residual import TwinResidual
+from models.families.twin import Twin
+from models.families.twin_kalman import TwinKalman
+from models.families.twin_residual import TwinResidual
+from models.numerics.twin_folds import Calibrations, TwinRun, _thinned
+from models.selection.crossing import Plan, cross_family, prepare
+from models.selection.race import Job, in_order
 from tests.models.twin_year import ROWS, true_values, year
 from twin.compile import compile_network
 
@@ -94,7 +94,7 @@ def test_where_a_fit_begins_does_not_matter_even_where_the_beginning_saw_a_spoil
 
 
 def test_error_channels_share_one_calibration(monkeypatch):
-    import models.solvers.twin_folds as folds
+    import models.numerics.twin_folds as folds
 
     calls = []
     real = folds._arrived

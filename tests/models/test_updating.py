@@ -8,9 +8,9 @@ import pytest
 
 from data.errors import InputError
 from features.design import Design
-from models.crossing import Plan, cross_family, prepare
-from models.trust import left_out_runs
-from models.updating import (
+from models.selection.crossing import Plan, cross_family, prepare
+from models.selection.trust import left_out_runs
+from models.selection.updating import (
     COLUMNS,
     COUNTS,
     SCHEDULES,

@@ -13,13 +13,13 @@ from data.checks import check_batch, check_machine
 from data.errors import InputError
 from data.machine import Machine, load_machine
 from data.recording import read_batches
-from models.axis_coupled import AxisCoupled
-from models.crossing import Plan
-from models.grid import run_grid
-from models.promotion import choose
+from models.families.axis_coupled import AxisCoupled
 from models.protocols import PromotionRule
-from models.result import GridResult
-from models.trust import Region
+from models.selection.crossing import Plan
+from models.selection.grid import run_grid
+from models.selection.promotion import choose
+from models.selection.result import GridResult
+from models.selection.trust import Region
 from pipelines import model_store
 from pipelines.commands.predict import predict_file
 from pipelines.request import TrainRequest, check_request

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from models.crossing import Crossing, FamilyResult, Plan, prepare
-from models.race import Job, rounds
+from models.selection.crossing import Crossing, FamilyResult, Plan, prepare
+from models.selection.race import Job, rounds
 from pipelines.checkpoint import Checkpoint
 from tests.toys.training import toy_batches
 

@@ -22,7 +22,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from models.promotion import choose
+from models.selection.promotion import choose
 from pipelines import registry
 from pipelines.commands.predict import load_model
 from pipelines.model_store import predict_frame

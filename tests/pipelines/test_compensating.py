@@ -22,8 +22,8 @@ from data.recording import read_batches
 from features.design import Design
 from models import FAMILIES
 from models.program import replay
-from models.trust import Region
-from models.updating import Updater, out_of_fold
+from models.selection.trust import Region
+from models.selection.updating import Updater, out_of_fold
 from pipelines import model_store
 from pipelines.cli import app
 from pipelines.compensating import Given, check_standing, compensator, write_export

@@ -14,9 +14,9 @@ from data.errors import WorkError
 from data.ingest import ingest
 from data.lake import Lake
 from data.machine import load_machine
-from models.crossing import Plan
 from models.protocols import PromotionRule
-from models.result import GridResult
+from models.selection.crossing import Plan
+from models.selection.result import GridResult
 from pipelines import diagnosing, training
 from pipelines.caller import DirectCaller
 from pipelines.diagnosing import diagnose_if_grown, greatest_growth, growth

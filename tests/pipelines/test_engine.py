@@ -14,9 +14,9 @@ import pandas as pd
 import pytest
 
 from data.errors import InputError, WorkError, one_of
-from models.crossing import FamilyResult, Plan, prepare
-from models.grid import Workers
-from models.race import rounds
+from models.selection.crossing import FamilyResult, Plan, prepare
+from models.selection.grid import Workers
+from models.selection.race import rounds
 from pipelines.caller import DirectCaller
 from pipelines.engine import ENGINES, DirectEngine, open_engine
 from pipelines.request import TrainRequest

@@ -12,7 +12,7 @@ import pytest
 from mlflow import MlflowClient
 
 from data.errors import InputError, WorkError
-from models.crossing import Plan
+from models.selection.crossing import Plan
 from pipelines import training
 from pipelines.caller import RETRIES, DirectCaller
 from pipelines.request import TrainRequest

@@ -20,8 +20,8 @@ import pytest
 from mlflow.tracking import MlflowClient
 
 from data.errors import WorkError
-from models.crossing import Plan
-from models.promotion import choose
+from models.selection.crossing import Plan
+from models.selection.promotion import choose
 from pipelines import checkpoint, model_store, registry, tracking
 from pipelines import store as store_module
 from pipelines.caller import DirectCaller

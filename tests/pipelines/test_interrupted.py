@@ -17,8 +17,8 @@ import psutil
 import pytest
 from mlflow.tracking import MlflowClient
 
-from models.crossing import Plan
-from models.promotion import decide
+from models.selection.crossing import Plan
+from models.selection.promotion import decide
 from pipelines import registry, runs, tracking
 from pipelines.caller import DirectCaller
 from pipelines.request import TrainRequest

@@ -12,9 +12,9 @@ import yaml
 from data.errors import InputError
 from models import FAMILIES
 from models.base import Family
-from models.trust import Region
-from models.twin import Twin
-from models.twin_kalman import TwinKalman
+from models.families.twin import Twin
+from models.families.twin_kalman import TwinKalman
+from models.selection.trust import Region
 from pipelines import model_store
 from pipelines.pyfunc_model import SERVED, Served
 from pipelines.serving import write_served

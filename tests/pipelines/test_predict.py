@@ -20,10 +20,10 @@ from data.errors import InputError
 from data.machine import parse_machine
 from models import FAMILIES
 from models.base import Family
-from models.conformal import RunBound
-from models.mlr import MLR
-from models.promotion import choose
-from models.trust import Region
+from models.families.mlr import MLR
+from models.selection.conformal import RunBound
+from models.selection.promotion import choose
+from models.selection.trust import Region
 from pipelines import model_store, registry
 from pipelines.cli import app
 from pipelines.commands.predict import as_cell, load_model, predict_batches, predict_file, summary

@@ -12,9 +12,9 @@ from mlflow.tracking import MlflowClient
 
 from compensation.faults import FaultCost
 from data.errors import InputError
-from models.promotion import Choice, choose, decide
 from models.protocols import PromotionRule
-from models.trust import Region
+from models.selection.promotion import Choice, choose, decide
+from models.selection.trust import Region
 from pipelines import audit, registry, tracking
 from pipelines.commands.predict import load_model
 from pipelines.commands.registry import _print_overview as printed
@@ -226,7 +226,7 @@ def test_a_choice_that_is_not_to_be_trusted_says_so(store):
     batches = toy_batches("toy-zero", 6)
     result = toy_result(batches, {"none|zero|0": [5.0] * 6, "none|mlr|2": [9.0] * 6})
     choice: Choice = choose(result, store.promotion)
-    from models.baselines import Zero
+    from models.families.baselines import Zero
 
     zero, training_id = Zero().fit(batches, (), "z"), log_training(result, store)
     new = registry.Newcomer(result, choice, zero, machine_yaml("toy-zero"), training_id, Region.of([], ()))

@@ -17,7 +17,7 @@ from mlflow.tracking import MlflowClient
 
 import thermodrift as td
 from data.errors import InputError
-from models.promotion import choose
+from models.selection.promotion import choose
 from pipelines import audit, registry, runs, tracking
 from tests.toys.command import Call, in_process
 from tests.toys.tracked import log_training

@@ -15,9 +15,9 @@ import pytest
 from data.errors import InputError
 from data.lake import Lake
 from features.rises import zeroed_error_um
-from models.crossing import Plan
 from models.metrics import residual_std_um
-from models.replay import Replay
+from models.selection.crossing import Plan
+from models.selection.replay import Replay
 from pipelines import model_store, registry, settings, tracking
 from pipelines.caller import DirectCaller
 from pipelines.commands.replay import replay_year, worth, write_replay_files
@@ -176,7 +176,7 @@ def test_disturbed_arrivals_end_in_the_same_lake_and_the_same_kind_of_champion(r
 def test_duplicates_change_nothing(recorded: Replay, given: Given, monkeypatch: pytest.MonkeyPatch) -> None:
     """With copies as the only disturbance, every champion and every error is that of the year as recorded."""
     import pipelines.replay as module
-    from models.replay import Arrival
+    from models.selection.replay import Arrival
 
     def twice(ids: Any, seed: int | None = None) -> tuple[Arrival, ...]:
         both = [a for name in ids for a in (Arrival(0, name, "as recorded"),

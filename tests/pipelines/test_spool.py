@@ -17,7 +17,7 @@ import pytest
 from mlflow.tracking import MlflowClient
 
 from data.errors import WorkError
-from models.crossing import Plan
+from models.selection.crossing import Plan
 from pipelines import registry, settings, spool, tracking
 from pipelines.caller import DirectCaller
 from pipelines.commands.train import training_dict

@@ -14,8 +14,8 @@ import pytest
 from mlflow.tracking import MlflowClient
 
 from data.errors import InputError, WorkError
-from models.promotion import judged
 from models.protocols import PromotionRule
+from models.selection.promotion import judged
 from pipelines import audit, runs, tracking
 from pipelines.settings import NamesPart, Settings
 from tests.toys.tracked import log_training

@@ -15,7 +15,7 @@ from mlflow import MlflowClient
 from data.errors import InputError
 from data.lake import Lake
 from models import FAMILIES
-from models.crossing import Plan
+from models.selection.crossing import Plan
 from pipelines import registry, tracking
 from pipelines.caller import DirectCaller
 from pipelines.commands.predict import predict_file

@@ -17,9 +17,9 @@ import pytest
 from data.ingest import ingest
 from data.machine import load_machine
 from features.rises import zeroed_error_um
-from models.crossing import Plan
 from models.metrics import residual_std_um
-from models.trust import farthest, watched
+from models.selection.crossing import Plan
+from models.selection.trust import farthest, watched
 from pipelines import fleet_state, model_store, registry, settings, training, watching
 from pipelines.alerts import fleet_view
 from pipelines.caller import DirectCaller

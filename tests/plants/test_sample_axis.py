@@ -14,8 +14,8 @@ from data.checks import check_batch, check_machine
 from data.errors import InputError
 from data.machine import Machine, load_machine
 from data.recording import read_batches
-from models.crossing import Plan
-from models.grid import run_grid
+from models.selection.crossing import Plan
+from models.selection.grid import run_grid
 from plants.sample.sample_axis import COLUMNS, POSITIONS, SENSOR_OFFSET_K, axis_runs, run_lathe, write_sample_axis
 from plants.sample.sample_lathe import AXES, LATHE, STEEL_UM_PER_M_K, Drive, feed_heat_W
 

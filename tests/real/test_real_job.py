@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from data.lake import Lake
-from models.crossing import Plan
+from models.selection.crossing import Plan
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT.parent / "shared" / "data"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.crossing import Plan
-from models.grid import run_grid
+from models.selection.crossing import Plan
+from models.selection.grid import run_grid
 from tests.real.recorded import recorded
 
 

@@ -19,12 +19,12 @@ import pytest
 
 from data import files as atomic_file
 from data.errors import InputError
-from models.crossing import Plan
-from models.grid import run_grid
-from models.outlook import outlook
-from models.promotion import Choice, choose
 from models.protocols import PromotionRule
-from models.result import GridResult, Training
+from models.selection.crossing import Plan
+from models.selection.grid import run_grid
+from models.selection.outlook import outlook
+from models.selection.promotion import Choice, choose
+from models.selection.result import GridResult, Training
 from reports.comparison import figure_pngs, write_report
 from reports.comparison.channel import left_out_panel
 from reports.comparison.page import page as page_of

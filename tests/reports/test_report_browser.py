@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from models.promotion import choose
 from models.protocols import PromotionRule
+from models.selection.promotion import choose
 from reports.comparison import write_report
 from reports.layout import Column, Page, Row, Table
 from reports.rendering import write_page

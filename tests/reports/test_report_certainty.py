@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from features.design import Design
-from models.crossing import Plan
-from models.gaussian_process import GaussianProcess
-from models.grid import run_grid
-from models.promotion import choose
+from models.families.gaussian_process import GaussianProcess
 from models.protocols import PromotionRule
-from models.result import GridResult
+from models.selection.crossing import Plan
+from models.selection.grid import run_grid
+from models.selection.promotion import choose
+from models.selection.result import GridResult
 from reports.comparison import write_report
 from reports.comparison.certainty import certainty_table, verdict
 from reports.comparison.tables import scored

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from models.promotion import choose, score_of_choice
 from models.protocols import PromotionRule
+from models.selection.promotion import choose, score_of_choice
 from reports.comparison.story import mark_of, promoted_cell, verdict
 from tests.snapshots import check_snapshot
 from tests.toys.report_training import COMPARISON, Maker, promotion, results, training

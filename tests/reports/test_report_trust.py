@@ -2,7 +2,7 @@
 
 import pandas as pd
 
-from models.trust import COLUMNS
+from models.selection.trust import COLUMNS
 from reports.comparison.certainty import bound_panel, bound_table
 
 

@@ -9,7 +9,7 @@ import pytest
 from features.design import Design
 from features.selectors import SELECTORS
 from features.selectors.base import Diagnostic
-from models.result import GridResult
+from models.selection.result import GridResult
 from reports.comparison import write_report
 from reports.comparison.certainty import MEANINGS, diagnostics_table
 from reports.labels import selector_label

@@ -25,7 +25,7 @@ from data.machine import Machine
 from data.readers.base import Block, Reader, Sheet
 from features.design import Design
 from features.selectors.correlation import Correlation
-from models.mlr import MLR
+from models.families.mlr import MLR
 from thermodrift.testing import (
     ContractCheck,
     ContractError,

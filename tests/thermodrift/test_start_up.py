@@ -55,6 +55,7 @@ def test_help_loads_what_prints_it(every: bool, tmp_path: Path) -> None:
 
 
 def test_what_status_and_predict_need_loads_no_large_part_of_scipy(tmp_path: Path) -> None:
-    used = "data.recording, features.design, models.promotion, models.trust, models.updating, models.solvers.lags"
+    selection = ", ".join(f"models.selection.{m}" for m in ("promotion", "trust", "updating"))
+    used = f"data.recording, features.design, {selection}, models.numerics.lags"
     code = f"import {used}, json, sys; print(json.dumps([m.replace('scipy.', 'scipy_') for m in sys.modules]))"
     assert not loaded(code, tmp_path) & {"scipy_signal", "scipy_stats", "scipy_optimize", "sklearn", "torch", "twin"}

@@ -12,12 +12,12 @@ import pytest
 
 from data.errors import InputError
 from data.registry import check_packages, packages_reason
-from models.crossing import Plan
+from models.selection.crossing import Plan
 from tests.test_architecture import graph
 from tests.toys.small_year import write_machine, write_year
 
 ROOT = Path(__file__).parents[2]
-TRAINERS = {"features.levenberg_marquardt", "models.solvers.torch_training"}
+TRAINERS = {"features.levenberg_marquardt", "models.numerics.torch_training"}
 HIDDEN = """
 from importlib.machinery import PathFinder
 find = PathFinder.find_spec
@@ -30,7 +30,7 @@ from pathlib import Path
 import thermodrift as td
 from data.errors import InputError
 from data.recording import read_batches
-from models.grid import run_grid
+from models.selection.grid import run_grid
 
 def refusal(do):
     try:

@@ -12,7 +12,7 @@ from typing import Any
 
 from features.design import Design
 from models import FAMILIES
-from models.mlr import MLR
+from models.families.mlr import MLR
 from pipelines.cli import main
 
 FAMILIES.add("endless", "tests.toys.endless_training:Endless")

@@ -11,12 +11,12 @@ from typing import Any
 import pandas as pd
 
 from data.batch import Batch, Finding
-from models.crossing import Crossing, Plan, cross_family
-from models.grid import run_grid
-from models.promotion import choose
 from models.protocols import PromotionRule
-from models.result import GridResult, Training
-from models.trust import left_out_runs
+from models.selection.crossing import Crossing, Plan, cross_family
+from models.selection.grid import run_grid
+from models.selection.promotion import choose
+from models.selection.result import GridResult, Training
+from models.selection.trust import left_out_runs
 from pipelines.settings import NamesPart, Settings
 
 Maker = Callable[..., list[Batch]]

@@ -10,7 +10,7 @@ from typing import Any
 
 from data.batch import Batch
 from diagnosis.result import Diagnosis
-from models.result import GridResult
+from models.selection.result import GridResult
 from pipelines import tracking
 from pipelines.settings import Settings
 

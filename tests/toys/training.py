@@ -10,9 +10,9 @@ import pandas as pd
 
 from data.batch import Batch
 from data.machine import parse_machine
-from models.mlr import MLR
-from models.result import SCORES, GridResult
-from models.trust import Region
+from models.families.mlr import MLR
+from models.selection.result import SCORES, GridResult
+from models.selection.trust import Region
 
 GAIN_UM_PER_K = (3.0, -1.5)
 

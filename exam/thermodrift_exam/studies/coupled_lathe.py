@@ -16,8 +16,8 @@ from data.machine import Machine
 from data.recording import read_batches
 from features.design import Design
 from features.rises import zeroed_error_um
-from models.axis_coupled import AxisCoupled
-from models.mlr import MLR
+from models.families.axis_coupled import AxisCoupled
+from models.families.mlr import MLR
 from plants.sample.runs import MACHINE_SHARE, ROOM
 from plants.sample.sample_axis import POSITIONS, SENSOR_OFFSET_K, write_sample_axis
 from plants.sample.sample_lathe import AXES, LATHE

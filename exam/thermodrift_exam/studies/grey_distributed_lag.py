@@ -9,10 +9,10 @@ import numpy as np
 from data.batch import Batch
 from features.design import Design
 from models.base import Family
-from models.distributed_lag import DistributedLag
-from models.gm1n import GM1N
-from models.gm_dl import GMDL
-from models.ridge import Ridge
+from models.families.distributed_lag import DistributedLag
+from models.families.gm1n import GM1N
+from models.families.gm_dl import GMDL
+from models.families.ridge import Ridge
 from plants.sample.runs import SimulatedRun
 from plants.sample.types import VMC, VMC_SENSORS
 from thermodrift_exam.studies.base import Figure, Ordering, Study, choices, predictions_um, residual_stds_um

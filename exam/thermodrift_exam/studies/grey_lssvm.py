@@ -10,10 +10,10 @@ from data.arrays import Array
 from features.design import Design
 from features.grey import synthetic_degree
 from models.base import Family
-from models.bp import BP
-from models.gm1n import GM1N
-from models.lssvm import LSSVM
-from models.solvers.grey_models import sequence_outputs
+from models.families.bp import BP
+from models.families.gm1n import GM1N
+from models.families.grey_models import sequence_outputs
+from models.families.lssvm import LSSVM
 from plants.sample.runs import SimulatedRun
 from plants.sample.types import HMC
 from thermodrift_exam.studies.base import Figure, Ordering, Study

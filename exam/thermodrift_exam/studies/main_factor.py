@@ -12,8 +12,8 @@ from features.design import Design
 from features.selectors.main_factor_bp import MainFactorBP, Sensitivity
 from features.selectors.statistics import ranking
 from models.base import Family
-from models.bp import BP
-from models.ridge import Ridge
+from models.families.bp import BP
+from models.families.ridge import Ridge
 from plants.sample.runs import SimulatedRun
 from plants.sample.types import LATHE, LATHE_SENSORS
 from thermodrift_exam.studies.base import Figure, Inputs, Ordering, Study, choices, predictions_um, residual_stds_um

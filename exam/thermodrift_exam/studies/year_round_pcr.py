@@ -12,10 +12,10 @@ from data.arrays import Array
 from data.batch import Batch
 from features.design import Design
 from models.base import Family
-from models.bp import BP
-from models.mlr import MLR
-from models.pcr import PCR
-from models.ridge import Ridge
+from models.families.bp import BP
+from models.families.mlr import MLR
+from models.families.pcr import PCR
+from models.families.ridge import Ridge
 from plants.sample.runs import Scatter, SimulatedRun
 from plants.sample.types import VMC, VMC_SENSORS
 from thermodrift_exam.studies.base import (

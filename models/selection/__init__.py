@@ -1,0 +1,1 @@
+"""From many scored cells to one model: the crossing, the race, promotion, trust in it, and its correction later."""

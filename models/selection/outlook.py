@@ -1,0 +1,105 @@
+"""What a training's model is expected to leave in the next season, as a number with a bound and one sentence."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from models.selection.conformal import expected_next
+from models.selection.promotion import Choice
+from models.selection.result import GridResult
+
+_MUCH_WORSE = 1.5  # later runs against the same runs left out one by one; a factor that a user would call another model
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """Expected S of a run in the next season, µm.
+
+    `S_um` is the mean left-out S under `protocol`, the one nearest to the next season that the recordings allow. Where
+    choosing among the cells costs, it is the nested score: every run by the cell that the other runs chose; `cell_S_um`
+    is that of the chosen cell itself, which the choice flatters.
+    `bound_um` covers the S of the next run with 90 % (`models.selection.conformal.expected_next`); `n_runs` under
+    `protocol`. `leave_batch_out_um`, `leave_batch_out_std_um`: S_mean and S_std by leave-batch-out; NaN where it was
+    not run. `warning`: the failing season, speed or block, where later runs are much worse than runs left out one by
+    one. `note`: why the number is optimistic, where the order in time is not known.
+    """
+
+    protocol: str
+    S_um: float
+    bound_um: float
+    n_runs: int
+    leave_batch_out_um: float
+    leave_batch_out_std_um: float
+    warning: str = ""
+    note: str = ""
+    cell_S_um: float = float("nan")
+
+    @property
+    def summary(self) -> str:
+        """The warning, the number with its bound, leave-batch-out, and the note."""
+        where = "next season" if self.protocol == "forward" else f"by {self.protocol}"
+        number = f"expected error {where}: S {self.S_um:.2f} µm, 90 % of runs below {self.bound_um:.2f} µm"
+        nested = ", each by the cell that the others chose" if self.nested else ""
+        parts = [self.warning, f"{number} ({self.protocol}, {self.n_runs} runs{nested})"]
+        if self.nested:
+            parts.append(f"the chosen cell itself, flattered by the choice, {self.cell_S_um:.2f} µm")
+        if self.protocol != "leave-batch-out" and np.isfinite(self.leave_batch_out_um):
+            parts.append(f"leave-batch-out {self.leave_batch_out_um:.2f} ± {self.leave_batch_out_std_um:.2f} µm")
+        return "; ".join(p for p in [*parts, self.note] if p)
+
+    @property
+    def nested(self) -> bool:
+        """Whether `S_um` is the nested score."""
+        return self.S_um > self.cell_S_um
+
+    def as_dict(self) -> dict[str, Any]:
+        return {**asdict(self), "summary": self.summary}
+
+
+def outlook(result: GridResult, choice: Choice) -> Outlook:
+    """The outlook of a chosen cell, from left-out scores; its bound grows as much as the nested score is larger."""
+    s = result.scores
+    own = s[(s["selector"] == choice.selector) & (s["family"] == choice.family) & (s["n_tsp"] == choice.n_tsp)]
+    own = own[np.isfinite(own["S_um"])]
+    led = expected_next(own)
+    later, near = (own[own["protocol"] == p] for p in ("forward", "leave-batch-out"))
+    mean, std = float(near["S_um"].mean()), float(near["S_um"].std())
+    warning = _warning(result, later, near) if len(later) and len(near) else ""
+    nested_um = choice.nested_S_mean_um if choice.protocol == led.protocol else led.S_um
+    cost = max(nested_um / led.S_um, 1.0) if led.S_um > 0 and np.isfinite(nested_um) else 1.0
+    return Outlook(
+        led.protocol, cost * led.S_um, cost * led.bound_um, led.n_runs, mean, std, warning,
+        _note(result, led.protocol), led.S_um,
+    )  # fmt: skip
+
+
+def _note(result: GridResult, protocol: str) -> str:
+    """Why no later run was predicted from earlier ones; a single batch left out has its neighbours in the training."""
+    if protocol == "forward":
+        return ""
+    reasons = result.excluded.loc[result.excluded["channel"] == "forward", "reason"]
+    why = f" ({reasons.iloc[0]})" if len(reasons) else ""
+    return f"optimistic: no later run was predicted from earlier ones{why}"
+
+
+def _warning(result: GridResult, later: pd.DataFrame, near: pd.DataFrame) -> str:
+    """Names the season, speed or block that fails, where forward is much worse than leave-batch-out on its runs."""
+    later = later.set_index("batch_id")
+    near_um = near.set_index("batch_id")["S_um"].reindex(later.index)
+    if not later["S_um"].mean() > _MUCH_WORSE * near_um.mean():
+        return ""
+    labels = result.batches.assign(batch_id=result.batches["batch_id"].astype(str)).set_index("batch_id")
+    groups = {c: labels[c].reindex(later.index) for c in ("season", "speed") if c in labels}
+    several = {c: label for c, label in groups.items() if label.nunique() > 1} or {"block": later["fold"]}
+    means = pd.concat([
+        later["S_um"].groupby(c + " " + label.astype(str)).agg(["mean", "size"]) for c, label in several.items()
+    ])  # fmt: skip
+    worst = means.nlargest(1, "mean").iloc[0]
+    return (
+        f"later runs fail: S {later['S_um'].mean():.1f} µm forward in time, {near_um.mean():.1f} µm where only the run "
+        f"itself is left out; worst in {worst.name} ({worst['mean']:.1f} µm, runs: {worst['size']:.0f})"
+    )
