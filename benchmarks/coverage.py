@@ -38,7 +38,7 @@ from models.selection.crossing import FamilyResult, Plan, cross_family, prepare,
 from models.selection.result import CELL_KEYS
 from models.selection.stack import best_cells
 from models.selection.trust import Region, left_out_runs
-from pipelines.model_store import StoredModel
+from pipelines.store.model_store import StoredModel
 from plants.sample.sample_year import write_sample_year
 from thermodrift_exam.plants.plant import draw
 

@@ -38,7 +38,7 @@ from models.selection.crossing import Plan, unfitted
 from models.selection.grid import run_grid
 from models.selection.outlook import outlook
 from models.selection.promotion import decide
-from pipelines.fitted_model import substitutes_of
+from pipelines.store.fitted_model import substitutes_of
 
 LAST, BLOCK = 12, 4  # runs that are predicted, and runs between two decisions
 

@@ -79,8 +79,8 @@ def recording(k: int, batch: int) -> pd.DataFrame:
 def trained(folder: Path, k: int, configured: Settings) -> dict[str, float]:
     """Seconds of every step for the k-th machine."""
     from pipelines.caller import DirectCaller
-    from pipelines.request import TrainRequest
-    from pipelines.training import train
+    from pipelines.jobs.request import TrainRequest
+    from pipelines.jobs.training import train
 
     file, recordings = write_machine(folder, k)
     begun_s = time.process_time()
@@ -90,9 +90,9 @@ def trained(folder: Path, k: int, configured: Settings) -> dict[str, float]:
 
 def stand_in(k: int, configured: Settings) -> float:
     """Put the k-th machine into lake, store and registry; the CPU seconds of the lake's part."""
-    from pipelines import tracking
-    from pipelines.recordings import home_lake
-    from pipelines.runs import experiment_id
+    from pipelines.jobs.recordings import home_lake
+    from pipelines.store import tracking
+    from pipelines.store.runs import experiment_id
 
     name, (machine_yaml, tags) = f"m{k:05d}", (MACHINE, {"kind": "training", "target": "z", "simulated": "true"})
     machine = parse_machine(machine_yaml.format(name=name), name)
@@ -118,8 +118,8 @@ def stand_in(k: int, configured: Settings) -> float:
 
 def look_ups(machine: str, configured: Settings) -> dict[str, float]:
     """CPU seconds of reading one machine's and everybody's state, medians."""
-    from pipelines import registry, tracking
-    from pipelines.recordings import home_lake
+    from pipelines.jobs.recordings import home_lake
+    from pipelines.store import registry, tracking
 
     client = tracking.open_store(configured)
     calls: dict[str, Callable[[], object]] = {
@@ -136,7 +136,7 @@ def look_ups(machine: str, configured: Settings) -> dict[str, float]:
 
 def restored(machine: str) -> None:
     """Withdraw a batch and bring it back: two commits to the lake's manifest."""
-    from pipelines.recordings import home_lake
+    from pipelines.jobs.recordings import home_lake
 
     lake = home_lake()
     (batch_id,) = lake.batch_ids(machine)[:1]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from pipelines.runs import code_version
+from pipelines.store.runs import code_version
 
 
 def write(path: Path, table: pd.DataFrame, command: str) -> None:

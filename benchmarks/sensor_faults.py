@@ -22,9 +22,9 @@ from compensation.faults import BEGINS, faults, watched, with_values
 from compensation.substitutes import Guard, Substitutes
 from data.batch import Batch
 from pipelines.commands.predict import load_model
-from pipelines.model_store import StoredModel
-from pipelines.recordings import checked_files
+from pipelines.jobs.recordings import checked_files
 from pipelines.settings import configure_environment, load
+from pipelines.store.model_store import StoredModel
 
 FOLDS = 6  # five sixths of the runs are as many as a training has
 COUNTS_UM = 10.0  # a smaller error of the prediction is within what a model leaves anyway

@@ -74,10 +74,10 @@ def settings_page() -> str:
 
 
 def fleet_page() -> str:
-    from pipelines import fleet
+    from pipelines.fleet import fleet_file
 
-    lines = ["# Fleet file", "", NOTE, "", _doc(fleet).split("\n\n")[0], ""]
-    return _text([*lines, *schema(fleet._File, "Keys")])
+    lines = ["# Fleet file", "", NOTE, "", _doc(fleet_file).split("\n\n")[0], ""]
+    return _text([*lines, *schema(fleet_file._File, "Keys")])
 
 
 def schema(root: type[BaseModel], title: str) -> list[str]:

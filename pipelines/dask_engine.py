@@ -20,8 +20,8 @@ from data.files import source_digest
 from data.processes import Shared, one_thread
 from models.selection.grid import Pool
 from pipelines.caller import LANES, Done, Say
-from pipelines.checkpoint import LIBRARIES, SOURCES, library_version
 from pipelines.settings import Settings, masked
+from pipelines.store.checkpoint import LIBRARIES, SOURCES, library_version
 
 try:
     from distributed import Client, Future, LocalCluster
@@ -34,8 +34,8 @@ except ModuleNotFoundError as missing:
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from pipelines.request import TrainRequest
-    from pipelines.training import TrainOutcome
+    from pipelines.jobs.request import TrainRequest
+    from pipelines.jobs.training import TrainOutcome
 
 logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters reaches the user as an error
 R = TypeVar("R")

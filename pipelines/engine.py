@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Protocol
 from data.errors import InputError
 from data.registry import Registry
 from pipelines.caller import DirectCaller, Done, Say
-from pipelines.request import TrainRequest
+from pipelines.jobs.request import TrainRequest
 from pipelines.settings import Settings
 
 if TYPE_CHECKING:
-    from pipelines.training import TrainOutcome
+    from pipelines.jobs.training import TrainOutcome
 
 ENGINES = Registry(
     "engine",
@@ -35,7 +35,7 @@ class Engine(Protocol):
     def train(
         self, request: TrainRequest, settings: Settings, say: Say = lambda text: None, done: Done | None = None
     ) -> TrainOutcome:
-        """`pipelines.training.train`; raises what that raises."""
+        """`pipelines.jobs.training.train`; raises what that raises."""
 
 
 class DirectEngine:
@@ -49,7 +49,7 @@ class DirectEngine:
         self, request: TrainRequest, settings: Settings, say: Say = lambda text: None, done: Done | None = None
     ) -> TrainOutcome:
         """See `Engine`."""
-        from pipelines.training import train
+        from pipelines.jobs.training import train
 
         return train(request, settings, DirectCaller(done), say)
 

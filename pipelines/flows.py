@@ -22,10 +22,10 @@ from data.errors import InputError, WorkError
 from data.machine import load_machine
 from models.selection.grid import Pools, local_pools
 from pipelines.caller import LANES, Done, Say, counted, label
-from pipelines.diagnosing import DiagnosisRequest, dated_folder, diagnose_file
-from pipelines.request import TrainRequest
+from pipelines.jobs.diagnosing import DiagnosisRequest, dated_folder, diagnose_file
+from pipelines.jobs.request import TrainRequest
+from pipelines.jobs.training import TrainOutcome, train
 from pipelines.settings import Settings, load
-from pipelines.training import TrainOutcome, train
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -82,7 +82,7 @@ def train_in_flow(
     pools: Pools = local_pools,
     lanes: int = LANES,
 ) -> TrainOutcome:
-    """`pipelines.training.train` as a flow; same functions, same numbers.
+    """`pipelines.jobs.training.train` as a flow; same functions, same numbers.
 
     Args:
         server: the start of a temporary server, see `prefect_server.start_server`.
@@ -135,7 +135,8 @@ def _parameters(request: TrainRequest) -> dict[str, Any]:
 
 @flow(name="thermodrift-diagnose", task_runner=ThreadPoolTaskRunner(max_workers=LANES), persist_result=False)
 def diagnose(machine_file: str, recordings: list[str], out: str = "") -> str:
-    """`pipelines.diagnosing.diagnose_file` as a flow, in a dated folder where no `out` is given; returns a summary.
+    """`pipelines.jobs.diagnosing.diagnose_file` as a flow, in a dated folder where no `out` is given; returns a
+    summary.
 
     An error is printed in one line, and the run counts as failed.
     """

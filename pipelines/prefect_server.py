@@ -18,11 +18,11 @@ from prefect.server.api.server import SubprocessASGIServer
 from data.endings import at_end, without_interrupt
 from pipelines.caller import Done, Say
 from pipelines.engine import no_address
-from pipelines.request import TrainRequest
+from pipelines.jobs.request import TrainRequest
 from pipelines.settings import Settings
 
 if TYPE_CHECKING:
-    from pipelines.training import TrainOutcome
+    from pipelines.jobs.training import TrainOutcome
 
 SERVER_START_S = 180  # its imports on a busy computer
 POPEN_S = 1.0  # for the operating system to start a process

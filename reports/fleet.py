@@ -23,7 +23,7 @@ def write_fleet_page(
     now: datetime,
     pages: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
-    """Write the page; rows and fleets as `pipelines.alerts` makes them, alerts as (machine, channel, reason).
+    """Write the page; rows and fleets as `pipelines.fleet.alerts` makes them, alerts as (machine, channel, reason).
 
     `pages` are the newest reports of trainings by machine, as links from the page.
 

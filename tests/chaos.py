@@ -40,7 +40,13 @@ from tests.toys.small_year import write_machine, write_year
 NAME, TARGET, BATCHES = "killed", "z", 11  # enough for a champion
 MODEL = f"{NAME}-{TARGET}"
 FAMILIES = ("zero", "mlr")
-LOADED = ("pipelines.cli", "pipelines.training", "pipelines.watching", "pipelines.compensating", "pyarrow.parquet")
+LOADED = (
+    "pipelines.cli",
+    "pipelines.jobs.training",
+    "pipelines.fleet.watching",
+    "pipelines.jobs.compensating",
+    "pyarrow.parquet",
+)
 WAIT_S = 600.0  # for a command on a busy computer
 ORPHANS_S = 15.0  # for workers, servers and the processes of a fleet to end without their parent, on a busy computer
 SAME = 1e-9  # relative difference of numbers that are the same
@@ -266,8 +272,9 @@ def _corrections(file: Path) -> dict[str, Any]:
 
 
 def _store_facts(home: Path) -> dict[str, Any]:
-    from pipelines import audit, model_store, registry, settings, tracking
-    from pipelines.runs import model_versions
+    from pipelines import settings
+    from pipelines.store import audit, model_store, registry, tracking
+    from pipelines.store.runs import model_versions
 
     configured = settings.load()
     client = tracking.open_store(configured)

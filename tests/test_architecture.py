@@ -37,7 +37,10 @@ EXAM: Mapping[str, set[str]] = {  # a distribution of its own, which no room of 
     },
 }  # fmt: skip
 EVERY = {**ALLOWED, **EXAM}
-FOLDERS: Mapping[str, tuple[str, ...]] = {"models": ("numerics", "families", "selection")}  # each may use those before
+FOLDERS: Mapping[str, tuple[str, ...]] = {  # a folder may use those before it
+    "models": ("numerics", "families", "selection"),
+    "pipelines": ("store", "jobs", "fleet", "commands"),
+}
 ORCHESTRATION = {"prefect", "mlflow", "typer"}
 PLANTS = {"plants", "thermodrift_exam.plants"}
 PLANTS_MAY_USE = {"data", *PLANTS, "numpy", "scipy", "pandas", "yaml", "skfem"}

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from models.selection.replay import Replay
     from models.selection.result import GridResult
     from pipelines.commands.simulate import Simulated
-    from pipelines.model_store import StoredModel
-    from pipelines.training import TrainOutcome
+    from pipelines.jobs.training import TrainOutcome
+    from pipelines.store.model_store import StoredModel
     from twin.calibration import Calibration, CalibrationOptions
 
 AnyMachine = Machine | Path | str
@@ -62,7 +62,7 @@ def read(recordings: Paths, machine: AnyMachine, *, need_error: bool = True) -> 
     Raises:
         InputError: no recording there, or one that cannot be used.
     """
-    from pipelines.recordings import checked_files
+    from pipelines.jobs.recordings import checked_files
 
     return checked_files(_machine(machine), _paths(recordings), need_error)
 
@@ -78,7 +78,7 @@ def ingest(recordings: Paths, machine: AnyMachine, lake: Lake | None = None) -> 
         WorkError: the lake cannot be written; what was stored before stays.
     """
     from data.ingest import ingest
-    from pipelines.recordings import home_lake
+    from pipelines.jobs.recordings import home_lake
 
     return ingest(_paths(recordings), _machine(machine), lake or home_lake(), progress=_log)
 
@@ -108,9 +108,10 @@ def train(
         WorkError: lake or tracking store do not answer.
     """
     from models.selection.crossing import Plan
-    from pipelines import settings, training
+    from pipelines import settings
     from pipelines.caller import DirectCaller
-    from pipelines.request import TrainRequest
+    from pipelines.jobs import training
+    from pipelines.jobs.request import TrainRequest
 
     settings.configure_environment()
     request = TrainRequest(
@@ -143,7 +144,7 @@ def cross(
     """
     from models.selection.crossing import Plan
     from models.selection.grid import run_grid
-    from pipelines.request import error_channels
+    from pipelines.jobs.request import error_channels
 
     known = _machine(machine)
     done = run_grid(
@@ -190,7 +191,7 @@ def save_model(model: Family, batches: Sequence[Batch], machine_file: Path | str
     Raises:
         InputError: a machine file that cannot be used, or a folder that holds something.
     """
-    from pipelines import fitted_model
+    from pipelines.store import fitted_model
 
     into = Path(folder)
     if into.exists() and (not into.is_dir() or any(into.iterdir())):
@@ -227,7 +228,7 @@ def predict(model: StoredModel | Path | str, recording: Batch | Path | str) -> p
         InputError: a model or file that cannot be used, or a missing input.
     """
     from pipelines.commands.predict import predict_batches
-    from pipelines.recordings import checked_files
+    from pipelines.jobs.recordings import checked_files
 
     known = load_model(model) if isinstance(model, Path | str) else model
     path = [] if isinstance(recording, Batch) else [Path(recording)]
@@ -265,8 +266,8 @@ def rehearse(
     Raises:
         InputError: models, recordings or failures that cannot be used.
     """
-    from pipelines.compensating import Given, labelled, rehearse_models
-    from pipelines.recordings import played_files
+    from pipelines.jobs.compensating import Given, labelled, rehearse_models
+    from pipelines.jobs.recordings import played_files
 
     names = _uris(models)
     known = [load_model(name) for name in names]
@@ -313,7 +314,7 @@ def replay(
     """
     from models.selection.crossing import Plan
     from pipelines.commands.replay import replay_year
-    from pipelines.replay import ReplayRequest
+    from pipelines.jobs.replay import ReplayRequest
 
     request = ReplayRequest(
         Path(machine_file), tuple(_paths(recordings)), Path(out), tuple(channels), plan or Plan(effort="quick"), start,
@@ -334,7 +335,7 @@ def export(models: Paths, to: str, out: Path | str | None = None, *, provisional
         InputError: an unknown form, a family that it cannot express, with those that can, or a model that may not act.
     """
     from pipelines.commands.predict import model_folder
-    from pipelines.compensating import write_export
+    from pipelines.jobs.compensating import write_export
     from pipelines.settings import configure_environment, load
 
     configure_environment()
@@ -472,7 +473,7 @@ def diagnose(
         WorkError: the model fails at the priors' means, or `out` cannot be written.
     """
     from diagnosis.diagnose import diagnose
-    from pipelines.diagnosing import DiagnosisRequest, check_diagnosis, write_diagnosis
+    from pipelines.jobs.diagnosing import DiagnosisRequest, check_diagnosis, write_diagnosis
 
     if out is None:
         return diagnose(_machine(machine), batches, seed=seed, processes=processes, progress=_progress)

@@ -1,6 +1,6 @@
 """The result of a replay: runs that arrived one by one, the retrainings between them, and what each model was worth.
 
-`pipelines.replay` makes it, `reports.replay` draws it. S is the residual standard deviation of a run in µm
+`pipelines.jobs.replay` makes it, `reports.replay` draws it. S is the residual standard deviation of a run in µm
 (`models.metrics`).
 """
 

@@ -209,7 +209,7 @@ def calibrate(
 ) -> None:
     """Fit the machine file's free parameters to recordings: values with 90 % intervals, and their left-out errors."""
     from data.account import Account
-    from pipelines.recordings import gather_batches
+    from pipelines.jobs.recordings import gather_batches
     from twin.calibration import CalibrationOptions
     from twin.calibration import calibrate as fit
 

@@ -51,7 +51,7 @@ def compensate(
     from compensation.connectors import open_sink, open_source
     from compensation.serving import StateFile, serve
     from pipelines.commands.predict import load_model
-    from pipelines.compensating import Given, check_standing, compensator
+    from pipelines.jobs.compensating import Given, check_standing, compensator
     from pipelines.settings import configure_environment, home, load
 
     if not period_s > 0:
@@ -115,8 +115,8 @@ def rehearse(
     """
     from data.account import Account
     from pipelines.commands.predict import load_model
-    from pipelines.compensating import Given, labelled, rehearse_models
-    from pipelines.recordings import check_recordings, played_files
+    from pipelines.jobs.compensating import Given, labelled, rehearse_models
+    from pipelines.jobs.recordings import check_recordings, played_files
     from pipelines.settings import configure_environment, home, load
     from reports.rehearsal import write_rehearsal
 
@@ -170,7 +170,7 @@ def export(
 ) -> None:
     """Write the receiver for a control, or a model as C, structured text, ONNX or JSON, with limits and fallback."""
     from pipelines.commands.predict import model_folder
-    from pipelines.compensating import Given, write_export
+    from pipelines.jobs.compensating import Given, write_export
     from pipelines.settings import configure_environment, load
 
     configure_environment()

@@ -1,4 +1,4 @@
-"""`thermodrift diagnose`: what physics the twin lacks; the work is in `pipelines.diagnosing`."""
+"""`thermodrift diagnose`: what physics the twin lacks; the work is in `pipelines.jobs.diagnosing`."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
     from diagnosis.findings.schema import Finding
     from diagnosis.result import Diagnosis
-    from pipelines.diagnosing import DiagnosisOutcome
+    from pipelines.jobs.diagnosing import DiagnosisOutcome
 
 
 def diagnosis_dict(outcome: DiagnosisOutcome) -> dict[str, Any]:
     """The outcome for other programs; `diagnosis` is findings.json as it was written."""
-    from pipelines.diagnosing import FINDINGS
+    from pipelines.jobs.diagnosing import FINDINGS
 
     return {
         "diagnosis": json.loads(outcome.files[FINDINGS].read_text(encoding="utf-8")),
@@ -52,7 +52,7 @@ def continued_dict(outcome: DiagnosisOutcome) -> dict[str, Any]:
 
 def print_diagnosis(outcome: DiagnosisOutcome) -> None:
     """The verdict, the findings, left-out errors, the next run and the files."""
-    from pipelines.diagnosing import FINDINGS, MACHINE, PLAN, REPORT
+    from pipelines.jobs.diagnosing import FINDINGS, MACHINE, PLAN, REPORT
     from reports.diagnosis.tables import experiment_sentence, headline, most_left
 
     contents = {
@@ -149,8 +149,8 @@ def diagnose(
     from pipelines import settings
 
     settings.configure_environment()
-    from pipelines.continuing import continue_diagnosis
-    from pipelines.diagnosing import DiagnosisRequest, diagnose_file
+    from pipelines.jobs.continuing import continue_diagnosis
+    from pipelines.jobs.diagnosing import DiagnosisRequest, diagnose_file
 
     given = tuple(recordings or ())
     if earlier is not None:

@@ -75,7 +75,7 @@ def ingest(
     from data.batch import finding_table
     from data.ingest import ingest as ingest_paths
     from data.machine import load_machine
-    from pipelines.recordings import home_lake, load_batches
+    from pipelines.jobs.recordings import home_lake, load_batches
 
     described = load_machine(machine)
     with console.progress(as_json) as (say, _):

@@ -28,7 +28,7 @@ def list_(
     as_json: Json = False,
 ) -> None:
     """Machines in the lake, or the batches of one machine, withdrawn ones included."""
-    from pipelines.recordings import home_lake
+    from pipelines.jobs.recordings import home_lake
 
     lake = home_lake()
     rows = [_machine_row(lake, m) for m in lake.machines(withdrawn=True)]
@@ -50,7 +50,7 @@ def show(
     as_json: Json = False,
 ) -> None:
     """One batch: versions, sources, findings, withdrawal, and the trainings and models that used it."""
-    from pipelines.recordings import home_lake
+    from pipelines.jobs.recordings import home_lake
 
     lake = home_lake()
     versions = lake.versions(machine, batch)
@@ -81,7 +81,7 @@ def show(
 @app.command()
 def withdraw(machine: MachineName, batches: Batches, reason: Reason, as_json: Json = False) -> None:
     """Take batches out of use until `restore`: no training loads them, and the same content is not stored again."""
-    from pipelines.recordings import home_lake
+    from pipelines.jobs.recordings import home_lake
 
     _print_withdrawn(machine, home_lake().withdraw(machine, batches, reason), as_json)
 
@@ -89,7 +89,7 @@ def withdraw(machine: MachineName, batches: Batches, reason: Reason, as_json: Js
 @app.command("forget-machine")
 def forget_machine(machine: MachineName, reason: Reason, as_json: Json = False) -> None:
     """Withdraw every batch of a machine; `purge --quarantined` then deletes what the lake holds of it."""
-    from pipelines.recordings import home_lake
+    from pipelines.jobs.recordings import home_lake
 
     _print_withdrawn(machine, home_lake().forget_machine(machine, reason), as_json)
 
@@ -97,7 +97,7 @@ def forget_machine(machine: MachineName, reason: Reason, as_json: Json = False) 
 @app.command()
 def restore(machine: MachineName, batches: Batches, as_json: Json = False) -> None:
     """Bring withdrawn batches back into use; purged ones can then be ingested again."""
-    from pipelines.recordings import home_lake
+    from pipelines.jobs.recordings import home_lake
 
     lake = home_lake()
     ids = lake.restore(machine, batches)
@@ -125,7 +125,7 @@ def purge(
 ) -> None:
     """Delete the content of withdrawn batches for good; reason and digest stay, and keep the same content out."""
     from data.manifest import chosen
-    from pipelines.recordings import home_lake
+    from pipelines.jobs.recordings import home_lake
 
     lake = home_lake()
     contents = lake.contents(machine)
@@ -191,7 +191,7 @@ def _trainings_with(machine: str, batch_ids: Sequence[str]) -> list[dict[str, An
     configured = settings.load()
     if configured.store_file is not None and not configured.store_file.exists():
         return []
-    from pipelines import registry, tracking
+    from pipelines.store import registry, tracking
 
     client = tracking.open_store(configured)
     with tracking.store_errors(configured):

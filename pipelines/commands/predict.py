@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from data.batch import Batch
-    from pipelines.model_store import StoredModel
     from pipelines.settings import Settings
+    from pipelines.store.model_store import StoredModel
 
 _NAMED = 3  # flagged runs in the summary line
 
@@ -32,7 +32,7 @@ def load_model(model_uri: str, settings: Settings) -> StoredModel:
         InputError: unknown name, alias, version, run or folder, with the closest.
         WorkError: the store does not answer.
     """
-    from pipelines import model_store
+    from pipelines.store import model_store
 
     return model_store.load(model_folder(model_uri, settings))
 
@@ -48,9 +48,9 @@ def model_folder(model_uri: str, settings: Settings) -> Path:
         return Path(model_uri)
     from mlflow.exceptions import MlflowException
 
-    from pipelines.model_store import registered
-    from pipelines.registry import find_version, local_folder, version_folder
-    from pipelines.tracking import open_store, store_errors
+    from pipelines.store.model_store import registered
+    from pipelines.store.registry import find_version, local_folder, version_folder
+    from pipelines.store.tracking import open_store, store_errors
 
     if model_uri.startswith("runs:/"):
         run_id = model_uri.removeprefix("runs:/").split("/")[0]
@@ -78,7 +78,7 @@ def predict_file(model_uri: str, file: Path, settings: Settings) -> pd.DataFrame
         InputError: unknown model, a file that cannot be read, a missing input; one line each.
     """
     from data.account import Account
-    from pipelines.recordings import checked_files
+    from pipelines.jobs.recordings import checked_files
 
     model = load_model(model_uri, settings)
     batches = checked_files(model.machine, [Path(file)], need_error=False, channels=model.channels())

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from mlflow.tracking import MlflowClient
 
-    from pipelines.audit import Log, When
     from pipelines.settings import Settings
+    from pipelines.store.audit import Log, When
 
 _MODEL = re.compile(r"^(?:models:/)?(?P<name>[^/@]+)(?:[/@](?P<which>[^/@]+))?$")
 _START_SHOWN = 16  # to the minute
@@ -54,8 +54,8 @@ def look_up(
         InputError: an unknown model, version, machine or time, or arguments that exclude each other.
         WorkError: the store does not answer, or holds a log entry that cannot be read.
     """
-    from pipelines.registry import CHAMPION
-    from pipelines.tracking import open_store, store_errors
+    from pipelines.store.registry import CHAMPION
+    from pipelines.store.tracking import open_store, store_errors
 
     match = None if model is None else _MODEL.match(model)
     if model is not None and match is None:
@@ -88,7 +88,7 @@ def overview(client: MlflowClient, logs: Sequence[Log]) -> pd.DataFrame:
     versions, note."""
     import pandas as pd
 
-    from pipelines.runs import versions_by_model
+    from pipelines.store.runs import versions_by_model
 
     columns = ["model", "machine", "target", "champion", "provisional", "since", "action", "who", "why", "versions",
                "note"]  # fmt: skip
@@ -111,7 +111,7 @@ def history(log: Log) -> pd.DataFrame:
     carried_out (False: interrupted, the champion did not change) and note."""
     import pandas as pd
 
-    from pipelines.audit import Entry
+    from pipelines.store.audit import Entry
 
     by_entry = {id(r.entry): r for r in log.reigns}
     rows = []
@@ -133,7 +133,7 @@ def champions(logs: Sequence[Log], at: When) -> pd.DataFrame:
     """
     import pandas as pd
 
-    from pipelines.audit import span_of
+    from pipelines.store.audit import span_of
 
     span = span_of(at)
     columns = ["model", "machine", "target", "version", "since", "until", "action", "who", "why", "training_id",
@@ -164,8 +164,8 @@ def lineage_of(client: MlflowClient, log: Log, which: str, settings: Settings) -
         InputError: unknown version or alias, or a training that the store has no longer.
     """
 
-    from pipelines.registry import find_version
-    from pipelines.tracking import load_training
+    from pipelines.store.registry import find_version
+    from pipelines.store.tracking import load_training
 
     version = find_version(client, log.model, which)
     tags, number = version.tags, int(version.version)
@@ -198,9 +198,9 @@ def lineage_of(client: MlflowClient, log: Log, which: str, settings: Settings) -
 
 def _logs(client: MlflowClient, name: str | None, machine: str | None) -> list[Log]:
     """The log of a model, or those of all models (of one machine) that thermodrift registered, by name."""
-    from pipelines.audit import read
-    from pipelines.registry import find_model
-    from pipelines.runs import registered_models
+    from pipelines.store.audit import read
+    from pipelines.store.registry import find_model
+    from pipelines.store.runs import registered_models
 
     if name is not None:
         return [read(find_model(client, name))]
@@ -216,7 +216,7 @@ def _logs(client: MlflowClient, name: str | None, machine: str | None) -> list[L
 
 
 def _only_champion(log: Log, at: When) -> str:
-    from pipelines.audit import span_of
+    from pipelines.store.audit import span_of
 
     versions = list(dict.fromkeys(champions([log], at)["version"].astype(int)))
     if len(versions) > 1:
@@ -270,7 +270,7 @@ def registry(
 
 
 def _plain(found: pd.DataFrame | Lineage, at: str) -> Any:
-    from pipelines.audit import span_of
+    from pipelines.store.audit import span_of
 
     if isinstance(found, Lineage):
         tables = {"batches": found.batches, "findings": found.findings}
@@ -308,7 +308,7 @@ def _print_history(name: str, table: pd.DataFrame) -> None:
 
 
 def _print_champions(table: pd.DataFrame, at: str) -> None:
-    from pipelines.audit import span_of
+    from pipelines.store.audit import span_of
 
     console.line(span_of(at))
     if table.empty:
@@ -369,7 +369,7 @@ def _time(text: str) -> datetime | None:
 
 
 def _local(when: datetime | None) -> str:
-    from pipelines.audit import stamp
+    from pipelines.store.audit import stamp
 
     return "at a time not recorded" if when is None else stamp(when)
 
@@ -384,7 +384,7 @@ def promote(
     from pipelines import settings
 
     settings.configure_environment()
-    from pipelines.training import promote_tracked
+    from pipelines.jobs.training import promote_tracked
 
     console.line(promote_tracked(training, machine, cell, force, settings.load()).summary)
 
@@ -400,6 +400,6 @@ def rollback(
     from pipelines import settings
 
     settings.configure_environment()
-    from pipelines import registry
+    from pipelines.store import registry
 
     console.line(registry.rollback(model, settings.load(), reason, of).summary)

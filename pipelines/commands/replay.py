@@ -14,7 +14,7 @@ from pipelines.options import Json, MachineFile, split
 
 if TYPE_CHECKING:
     from models.selection.replay import Replay, Retraining, Score
-    from pipelines.replay import ReplayRequest
+    from pipelines.jobs.replay import ReplayRequest
 
 
 def print_replay(r: Replay) -> None:
@@ -68,7 +68,7 @@ def replay_year(request: ReplayRequest, say: Say, done: Done) -> Replay:
     """Replay and write its files; nothing is written elsewhere, so the home's environment is not configured."""
     from pipelines import settings
     from pipelines.caller import DirectCaller
-    from pipelines.replay import replay
+    from pipelines.jobs.replay import replay
 
     result = replay(request, settings.load(), DirectCaller(), say, done)
     write_replay_files(result, request.out)
@@ -94,7 +94,7 @@ def replay(
     goes on where it was stopped.
     """
     from models.selection.crossing import FINALISTS, Plan
-    from pipelines.replay import ReplayRequest
+    from pipelines.jobs.replay import ReplayRequest
 
     plan = Plan(effort=one_of(effort, FINALISTS, "--effort"))
     request = ReplayRequest(machine, tuple(recordings), out, split(channels), plan, start, every, disturb)

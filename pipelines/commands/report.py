@@ -25,8 +25,9 @@ def write_comparison(machine: str, training_ids: Sequence[str], to: Path | None,
         InputError: a path whose suffix does not fit the form, an unknown training, or none tracked.
         WorkError: the store does not answer.
     """
-    from pipelines import settings, tracking
-    from pipelines.request import REPORT_SUFFIXES
+    from pipelines import settings
+    from pipelines.jobs.request import REPORT_SUFFIXES
+    from pipelines.store import tracking
     from reports.comparison import write_report
 
     if to is not None:
@@ -77,7 +78,7 @@ def write_thermal_tests(
 
 def _tested_batches(machine: Machine, recordings: Sequence[str], lake: Lake) -> Iterator[Batch]:
     from data.checks import checked
-    from pipelines.recordings import load_batches, read_files
+    from pipelines.jobs.recordings import load_batches, read_files
 
     held = lake.batch_ids(machine.machine)
     if not recordings:
@@ -128,7 +129,7 @@ def report(
         return
     if form:
         raise InputError("--format: with --iso both forms are written; leave it out")
-    from pipelines.recordings import home_lake
+    from pipelines.jobs.recordings import home_lake
 
     folder = to or settings.home() / "reports" / f"iso-{Path(machine).stem}"
     with console.progress(False) as (say, _):

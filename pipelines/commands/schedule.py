@@ -21,8 +21,8 @@ def schedule(
     check: Annotated[bool, typer.Option("--check", help="check the fleet and its machine files, and end")] = False,
 ) -> None:
     """Retrain machines when they are due: new batches are ingested and learned; runs until interrupted."""
-    from pipelines.fleet import Fleet, load_fleet, of_one
-    from pipelines.fleet_service import checked, local_timezone, serve_fleet
+    from pipelines.fleet.fleet_file import Fleet, load_fleet, of_one
+    from pipelines.fleet.service import checked, local_timezone, serve_fleet
     from pipelines.home import home
 
     served: Fleet

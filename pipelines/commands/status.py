@@ -18,7 +18,7 @@ from pipelines.home import home
 from pipelines.options import Json
 
 if TYPE_CHECKING:
-    from pipelines.alerts import FleetView, Row
+    from pipelines.fleet.alerts import FleetView, Row
 
 TRAININGS_SHOWN = 12
 ALERT_CODE = 3
@@ -132,11 +132,11 @@ def status(
     alert: Annotated[bool, typer.Option("--alert", help=f"exit code {ALERT_CODE} where there is an alert")] = False,
 ) -> None:
     """Which champion runs on which machine, whether it still holds, and what needs attention; models, the lake."""
-    from pipelines import watching
+    from pipelines.fleet import watching
 
     _deliver()
     found = watching.warm() or _gathered(as_json)
-    from pipelines.alerts import fleet_view
+    from pipelines.fleet.alerts import fleet_view
 
     view = fleet_view(Path(found["home"]), found["channels"])
     if html is not None:
@@ -174,14 +174,14 @@ def newest_reports(machines: Iterable[str], page: Path) -> dict[str, str]:
 
 
 def _deliver() -> None:
-    """What the tracking store does not have yet, see `pipelines.spool`."""
+    """What the tracking store does not have yet, see `pipelines.store.spool`."""
     if not any((home() / "spool").glob("[0-9]*")):
         return
     from pipelines import settings
 
     settings.configure_environment()
-    from pipelines import spool
-    from pipelines.training import promote_waiting
+    from pipelines.jobs.training import promote_waiting
+    from pipelines.store import spool
 
     configured = settings.load()
     for done in spool.deliver(configured, partial(promote_waiting, configured), console.note):
@@ -192,7 +192,7 @@ def _gathered(quiet: bool) -> dict[str, Any]:
     from pipelines import settings
 
     settings.configure_environment()
-    from pipelines.watching import refresh
+    from pipelines.fleet.watching import refresh
 
     with console.progress(quiet) as (say, _):
         return refresh(settings.load(), say)

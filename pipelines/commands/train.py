@@ -1,4 +1,4 @@
-"""`thermodrift train`: the main job; its steps are in `pipelines.training`."""
+"""`thermodrift train`: the main job; its steps are in `pipelines.jobs.training`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipelines.options import Json, MachineFile, names, split
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pipelines.training import TrainOutcome
+    from pipelines.jobs.training import TrainOutcome
 
 SHOWN = 8  # families on the leaderboard
 _SHOWN_PROTOCOLS = {"forward": "forward", "leave-season-out": "season out", "leave-batch-out": "batch out"}
@@ -141,7 +141,7 @@ def train(
     from models.protocols import PROTOCOLS
     from models.selection.crossing import FINALISTS, Plan
     from pipelines.engine import ENGINES, open_engine
-    from pipelines.request import TrainRequest, check_request
+    from pipelines.jobs.request import TrainRequest, check_request
 
     one_of(engine, ENGINES, "--engine")
     if direct and engine not in ("prefect", "direct"):
@@ -156,7 +156,7 @@ def train(
     request = TrainRequest(machine, tuple(recordings or ()), split(channels), plan, report, promote)
     check_request(request, configured)  # before a server starts
     if configured.store_file is None:
-        from pipelines.tracking import open_store
+        from pipelines.store.tracking import open_store
 
         open_store(configured)
     chosen = open_engine("direct" if direct else engine, address)

@@ -62,7 +62,7 @@ def store_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def store(store_home: Path) -> Iterator[object]:
     """Settings on the session's SQLite store; THERMODRIFT_HOME points there while it is made."""
     from pipelines import settings as module
-    from pipelines import tracking
+    from pipelines.store import tracking
 
     before = os.environ.get("THERMODRIFT_HOME")
     os.environ["THERMODRIFT_HOME"] = str(store_home)

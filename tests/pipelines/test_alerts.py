@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 
 from data.files import write_atomic
-from pipelines import alerts, fleet_state
-from pipelines.alerts import alerts_of, machine_alerts
-from pipelines.fleet import AlertRules, Fleet, FleetMachine
-from pipelines.watching import SCHEMA
+from pipelines.fleet import alerts, fleet_state
+from pipelines.fleet.alerts import alerts_of, machine_alerts
+from pipelines.fleet.fleet_file import AlertRules, Fleet, FleetMachine
+from pipelines.fleet.watching import SCHEMA
 
 NOW = datetime(2026, 11, 25, 12, 0, tzinfo=UTC)
 RULES = AlertRules()

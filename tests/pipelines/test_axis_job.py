@@ -20,9 +20,9 @@ from models.selection.grid import run_grid
 from models.selection.promotion import choose
 from models.selection.result import GridResult
 from models.selection.trust import Region
-from pipelines import model_store
 from pipelines.commands.predict import predict_file
-from pipelines.request import TrainRequest, check_request
+from pipelines.jobs.request import TrainRequest, check_request
+from pipelines.store import model_store
 from plants.sample.sample_axis import write_sample_axis
 from reports.comparison import figure_pngs, write_report
 from reports.comparison.channel import left_out_panel

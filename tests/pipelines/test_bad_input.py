@@ -273,7 +273,7 @@ def test_training_says_what_went_to_quarantine(place: Place) -> None:
 def test_the_recording_of_another_machine_for_a_model(
     place: Place, store: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pipelines import model_store
+    from pipelines.store import model_store
     from tests.toys.training import machine_yaml, toy_batches, toy_model
 
     model, region = toy_model(toy_batches("toy-other", 4))

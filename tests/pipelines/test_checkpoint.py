@@ -10,7 +10,7 @@ import pytest
 
 from models.selection.crossing import Crossing, FamilyResult, Plan, prepare
 from models.selection.race import Job, rounds
-from pipelines.checkpoint import Checkpoint
+from pipelines.store.checkpoint import Checkpoint
 from tests.toys.training import toy_batches
 
 PLAN = Plan(("none", "correlation"), ("zero", "mlr", "gm1n"), ("leave-batch-out", "train-on-one"))

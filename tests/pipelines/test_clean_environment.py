@@ -23,9 +23,9 @@ import pandas as pd
 import pytest
 
 from models.selection.promotion import choose
-from pipelines import registry
 from pipelines.commands.predict import load_model
-from pipelines.model_store import predict_frame
+from pipelines.store import registry
+from pipelines.store.model_store import predict_frame
 from tests.toys.tracked import log_training
 from tests.toys.training import machine_yaml, toy_batches, toy_model, toy_result
 

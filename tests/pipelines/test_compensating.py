@@ -24,11 +24,11 @@ from models import FAMILIES
 from models.program import replay
 from models.selection.trust import Region
 from models.selection.updating import Updater, out_of_fold
-from pipelines import model_store
 from pipelines.cli import app
-from pipelines.compensating import Given, check_standing, compensator, write_export
-from pipelines.pyfunc_model import SERVED, Served
-from pipelines.serving import write_served
+from pipelines.jobs.compensating import Given, check_standing, compensator, write_export
+from pipelines.store import model_store
+from pipelines.store.pyfunc_model import SERVED, Served
+from pipelines.store.serving import write_served
 from tests.toys.small_year import write_machine, write_year
 
 INPUTS = ("front", "bed")
@@ -305,7 +305,7 @@ def test_it_imports_nothing_of_thermodrift(year: Path, tmp_path: Path) -> None:
     write_served(stored, tmp_path, 300.0)
     table = frame_of(year, stored)
     table.to_csv(tmp_path / "rows.csv", index=False)
-    (tmp_path / "served.py").write_text((ROOT / "pipelines" / "pyfunc_model.py").read_text())
+    (tmp_path / "served.py").write_text((ROOT / "pipelines" / "store" / "pyfunc_model.py").read_text())
     code = (
         f"import sys; sys.path = [p for p in sys.path if p not in ('', {str(ROOT)!r})]; sys.path.insert(0, '.')\n"
         "import pandas, served, pathlib\n"

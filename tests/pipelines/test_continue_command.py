@@ -18,8 +18,8 @@ from data.batch import Batch, Channel
 from data.machine import load_machine
 from diagnosis.findings.schema import read_findings
 from diagnosis.result import Diagnosis
-from pipelines import diagnosing
-from pipelines.continuing import follows
+from pipelines.jobs import diagnosing
+from pipelines.jobs.continuing import follows
 from reports.diagnosis.first_screen import Continued
 from reports.diagnosis.page import write_diagnosis_report
 from tests.toys.command import Call, Done, in_process

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from pipelines.fleet import Fleet, FleetMachine, When
-from pipelines.folders import Folders
+from pipelines.fleet.fleet_file import Fleet, FleetMachine, When
+from pipelines.fleet.folders import Folders
 
 pytestmark = pytest.mark.slow
 
@@ -22,7 +22,7 @@ SOON = timedelta(seconds=1)
 @pytest.fixture
 def module(flows: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """Imported after the environment of Prefect is set; polls whenever it may."""
-    from pipelines import deployments as module
+    from pipelines.fleet import deployments as module
 
     for name in ("POLL_S", "LOST_POLL_S", "UPCOMING_S"):
         monkeypatch.setattr(module, name, 0.0)
@@ -82,7 +82,7 @@ def test_each_machine_has_a_deployment(served: Served, client: Any, tmp_path: Pa
     assert source.due(datetime.now(UTC)) == [] and not said
     there = client.read_deployment_by_name("thermodrift-retrain/retrain-dep-a")
     assert [(s.schedule.cron, s.schedule.timezone) for s in there.schedules] == [("30 4 * * 2", "Europe/Berlin")]
-    assert there.parameters == fleet.machines[0].parameters and there.entrypoint == "pipelines.retraining.retrain"
+    assert there.parameters == fleet.machines[0].parameters and there.entrypoint == "pipelines.fleet.retraining.retrain"
     served(fleet).due(datetime.now(UTC))
     assert client.read_deployment_by_name("thermodrift-retrain/retrain-dep-a").updated == there.updated
     other = replace(fleet, machines=(replace(fleet.machines[0], when=When(every_h=6.0)),))

@@ -15,7 +15,7 @@ from data.errors import WorkError
 from data.machine import load_machine
 from diagnosis.findings.schema import read_findings
 from diagnosis.result import Diagnosis
-from pipelines import diagnosing
+from pipelines.jobs import diagnosing
 from tests.toys.command import Call, Done, in_process
 from tests.toys.diagnoser import NOTE, PLAN, Toy, write_machine, write_recordings
 from tests.toys.diagnosis import toy_diagnosis
@@ -243,7 +243,7 @@ def test_what_is_not_tracked_is_told(
         raise WorkError("tracking store sqlite:///x: database is locked")
 
     with monkeypatch.context() as patch:
-        patch.setattr("pipelines.spool.log_record", broken)
+        patch.setattr("pipelines.store.spool.log_record", broken)
         done = diagnose("--no-report")
     out = tmp_path / "out"
     assert (done.code, one_line(done)) == (

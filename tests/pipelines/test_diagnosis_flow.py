@@ -10,8 +10,8 @@ import pytest
 
 from data.errors import InputError, WorkError
 from diagnosis.findings.schema import read_findings
-from pipelines import diagnosing
-from pipelines.tracking import diagnoses
+from pipelines.jobs import diagnosing
+from pipelines.store.tracking import diagnoses
 from tests.toys.diagnoser import Toy, write_machine, write_recordings
 
 
@@ -62,7 +62,7 @@ def test_what_stops_it_is_one_line_and_is_not_tried_again(
 def test_retraining_tells_of_the_diagnosis(
     flows: ModuleType, toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pipelines import retraining
+    from pipelines.fleet import retraining
 
     monkeypatch.setattr(diagnosing, "diagnose_if_grown", lambda *_, **__: (None, "z: left-out S has grown; diagnosed"))
     machine = write_machine(tmp_path / "m.yml", "flow-season")

@@ -10,9 +10,9 @@ import pytest
 from mlflow.tracking import MlflowClient
 
 from diagnosis.result import Diagnosis
-from pipelines import tracking
 from pipelines.settings import Settings
-from pipelines.tracking import diagnoses
+from pipelines.store import tracking
+from pipelines.store.tracking import diagnoses
 from tests.toys.diagnosis import toy_diagnosis
 from tests.toys.tracked import log_diagnosis
 from tests.toys.training import toy_batches

@@ -17,10 +17,10 @@ from data.machine import load_machine
 from models.protocols import PromotionRule
 from models.selection.crossing import Plan
 from models.selection.result import GridResult
-from pipelines import diagnosing, training
 from pipelines.caller import DirectCaller
-from pipelines.diagnosing import diagnose_if_grown, greatest_growth, growth
-from pipelines.request import TrainRequest
+from pipelines.jobs import diagnosing, training
+from pipelines.jobs.diagnosing import diagnose_if_grown, greatest_growth, growth
+from pipelines.jobs.request import TrainRequest
 from pipelines.settings import DiagnoseRule, Settings
 from tests.toys.diagnoser import Toy, write_machine, write_recordings
 from tests.toys.tracked import log_training

@@ -19,8 +19,8 @@ from models.selection.grid import Workers
 from models.selection.race import rounds
 from pipelines.caller import DirectCaller
 from pipelines.engine import ENGINES, DirectEngine, open_engine
-from pipelines.request import TrainRequest
-from pipelines.training import TrainOutcome, train
+from pipelines.jobs.request import TrainRequest
+from pipelines.jobs.training import TrainOutcome, train
 from tests.conftest import make_toy_batches
 from tests.toys.command import in_process
 from tests.toys.postgres import free_port

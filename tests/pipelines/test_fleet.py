@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from data.errors import InputError
-from pipelines.fleet import AlertRules, Fleet, FleetMachine, When, load_fleet, of_one
+from pipelines.fleet.fleet_file import AlertRules, Fleet, FleetMachine, When, load_fleet, of_one
 
 GOOD = """
 at_once: 2

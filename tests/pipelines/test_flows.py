@@ -13,9 +13,9 @@ from mlflow import MlflowClient
 
 from data.errors import InputError, WorkError
 from models.selection.crossing import Plan
-from pipelines import training
 from pipelines.caller import RETRIES, DirectCaller
-from pipelines.request import TrainRequest
+from pipelines.jobs import training
+from pipelines.jobs.request import TrainRequest
 from tests.toys.small_year import write_machine, write_year
 
 PLAN = Plan(("none", "correlation"), ("zero", "ridge", "pls"), ("leave-batch-out", "train-on-one"))

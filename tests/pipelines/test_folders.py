@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from pipelines import folders as module
-from pipelines.fleet import Fleet, FleetMachine, When
-from pipelines.folders import Folders
+from pipelines.fleet import folders as module
+from pipelines.fleet.fleet_file import Fleet, FleetMachine, When
+from pipelines.fleet.folders import Folders
 
 
 def fleet_of(**folders: Path) -> Fleet:

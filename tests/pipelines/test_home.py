@@ -22,12 +22,11 @@ from mlflow.tracking import MlflowClient
 from data.errors import WorkError
 from models.selection.crossing import Plan
 from models.selection.promotion import choose
-from pipelines import checkpoint, model_store, registry, tracking
-from pipelines import store as store_module
 from pipelines.caller import DirectCaller
-from pipelines.request import TrainRequest
+from pipelines.jobs.request import TrainRequest
+from pipelines.jobs.training import train
 from pipelines.settings import NamesPart, Settings
-from pipelines.training import train
+from pipelines.store import checkpoint, database, model_store, registry, tracking
 from tests.toys.command import in_process
 from tests.toys.small_year import write_machine, write_year
 from tests.toys.tracked import log_training
@@ -37,7 +36,8 @@ S_UM = {"none|zero|0": [50.0, 51.0, 52.0], "none|mlr|2": [1.0, 2.0, 1.5]}
 OPEN = """
 import sys
 from data.errors import WorkError
-from pipelines import settings, tracking
+from pipelines import settings
+from pipelines.store import tracking
 try:
     tracking.open_store(settings.load())
 except WorkError as error:
@@ -61,8 +61,8 @@ def test_a_disk_that_is_full_while_the_store_is_made_leaves_nothing(tmp_path: Pa
     assert done.stderr.startswith(f"tracking store sqlite:///{tmp_path / 'mlflow.db'}: (sqlite3.OperationalError) ")
     assert [p.name for p in tmp_path.iterdir()] == ["mlflow.db.lock"]
     file = tmp_path / "mlflow.db"
-    store_module.make(file, lambda made: shutil.copy(store.store_file, made))  # the next run
-    assert store_module.is_made(file)
+    database.make(file, lambda made: shutil.copy(store.store_file, made))  # the next run
+    assert database.is_made(file)
 
 
 def test_two_first_uses_make_one_store(tmp_path: Path) -> None:
@@ -75,8 +75,8 @@ def test_two_first_uses_make_one_store(tmp_path: Path) -> None:
             db.execute("create table alembic_version (version_num text)")
 
     with ThreadPoolExecutor() as pool:
-        list(pool.map(lambda _: store_module.make(tmp_path / "mlflow.db", fill), range(3)))
-    assert len(made) == 1 and store_module.is_made(tmp_path / "mlflow.db")
+        list(pool.map(lambda _: database.make(tmp_path / "mlflow.db", fill), range(3)))
+    assert len(made) == 1 and database.is_made(tmp_path / "mlflow.db")
 
 
 @pytest.mark.parametrize("left", ["", "create table runs (run_uuid text)"])
@@ -88,12 +88,12 @@ def test_what_an_interrupted_first_use_left_is_made_anew(left: str, tmp_path: Pa
         db.executescript(left)
     scratch = tmp_path / ".making-killed"
     scratch.mkdir()
-    assert not store_module.is_made(file)
-    store_module.make(file, lambda made: made.write_bytes(b"whole"))
+    assert not database.is_made(file)
+    database.make(file, lambda made: made.write_bytes(b"whole"))
     assert file.read_bytes() == b"whole" and not scratch.exists()
     with sqlite3.connect(tmp_path / "old.db") as db:  # of an old MLflow, with runs: MLflow reports it
         db.executescript("create table runs (run_uuid text); insert into runs values ('1')")
-    assert store_module.is_made(tmp_path / "old.db")
+    assert database.is_made(tmp_path / "old.db")
 
 
 def test_a_home_that_cannot_be_written_is_one_line(
@@ -162,7 +162,7 @@ def test_a_disk_that_is_full_at_a_step_keeps_the_crossing(
 def test_a_home_that_moved_or_was_copied_has_its_files(store: Any, tmp_path: Path) -> None:
     """Runs, models and new runs: all in the home that is used, also while the one that it is a copy of is there."""
     first = at_home(store, tmp_path / "first")
-    store_module.make(first.store_file, lambda made: shutil.copy(store.store_file, made))
+    database.make(first.store_file, lambda made: shutil.copy(store.store_file, made))
     batches = toy_batches("toy_moved-50", 3)
     result = toy_result(batches, S_UM)
     training_id = log_training(result, first)
@@ -191,10 +191,10 @@ def test_a_home_that_moved_or_was_copied_has_its_files(store: Any, tmp_path: Pat
 def test_other_artifacts_in_the_settings_move_nothing(store: Any, tmp_path: Path) -> None:
     """Without the files there, the earlier runs keep their addresses."""
     own = at_home(store, tmp_path)
-    store_module.make(own.store_file, lambda made: shutil.copy(store.store_file, made))
+    database.make(own.store_file, lambda made: shutil.copy(store.store_file, made))
     training_id = log_training(toy_result(toy_batches("toy-elsewhere", 3), S_UM), own)
-    assert store_module.follow(own.store_file, (tmp_path / "elsewhere").as_uri()) == []
-    assert store_module.follow(own.store_file, "s3://bucket/artifacts") == []
+    assert database.follow(own.store_file, (tmp_path / "elsewhere").as_uri()) == []
+    assert database.follow(own.store_file, "s3://bucket/artifacts") == []
     assert tracking.load_training(training_id, own)
     mlflow.set_tracking_uri(store.store_uri)
 

@@ -19,10 +19,10 @@ from mlflow.tracking import MlflowClient
 
 from models.selection.crossing import Plan
 from models.selection.promotion import decide
-from pipelines import registry, runs, tracking
 from pipelines.caller import DirectCaller
-from pipelines.request import TrainRequest
-from pipelines.training import train
+from pipelines.jobs.request import TrainRequest
+from pipelines.jobs.training import train
+from pipelines.store import registry, runs, tracking
 from tests.toys.small_year import write_machine, write_year
 from tests.toys.tracked import log_training
 from tests.toys.training import machine_yaml, toy_batches, toy_model, toy_result

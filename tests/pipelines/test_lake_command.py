@@ -14,9 +14,9 @@ from data.errors import InputError
 from data.lake import Lake
 from data.machine import load_machine
 from pipelines.caller import DirectCaller
-from pipelines.recordings import gather_batches, load_batches
-from pipelines.request import TrainRequest
-from pipelines.training import Plan, promote_tracked, train
+from pipelines.jobs.recordings import gather_batches, load_batches
+from pipelines.jobs.request import TrainRequest
+from pipelines.jobs.training import Plan, promote_tracked, train
 from tests.conftest import make_toy_batches
 from tests.toys.command import Call, in_process
 from tests.toys.small_year import write_machine, write_year

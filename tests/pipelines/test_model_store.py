@@ -15,9 +15,9 @@ from models.base import Family
 from models.families.twin import Twin
 from models.families.twin_kalman import TwinKalman
 from models.selection.trust import Region
-from pipelines import model_store
-from pipelines.pyfunc_model import SERVED, Served
-from pipelines.serving import write_served
+from pipelines.store import model_store
+from pipelines.store.pyfunc_model import SERVED, Served
+from pipelines.store.serving import write_served
 from reports.labels import family_label, styles
 from tests.models.twin_year import year
 from tests.toys.training import machine_yaml, toy_batches, toy_model

@@ -17,7 +17,8 @@ from pathlib import Path
 import pytest
 
 from data.errors import InputError, WorkError
-from pipelines import settings, store, tracking
+from pipelines import settings
+from pipelines.store import database, tracking
 from tests.toys.command import Call, in_process
 from tests.toys.postgres import PASSWORD, Server, free_port, postgres
 from tests.toys.small_year import write_machine, write_year
@@ -85,12 +86,12 @@ def test_one_process_at_a_time_holds_a_key(server: Server, call: Call, tmp_path:
     held = "select count(*) from pg_locks where locktype = 'advisory' and granted"
 
     def enter() -> str:
-        with store.exclusive(loaded, "a"):
+        with database.exclusive(loaded, "a"):
             return server.sql("locks", held)
 
     with ThreadPoolExecutor(1) as pool:  # has a connection of its own, as another computer would
-        with store.exclusive(loaded, "a"):
-            with store.exclusive(loaded, "b"):
+        with database.exclusive(loaded, "a"):
+            with database.exclusive(loaded, "b"):
                 assert server.sql("locks", held) == "2"
             entered = pool.submit(enter)
             while server.sql("locks", "select count(*) from pg_locks where not granted") != "1":

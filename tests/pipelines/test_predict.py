@@ -24,9 +24,9 @@ from models.families.mlr import MLR
 from models.selection.conformal import RunBound
 from models.selection.promotion import choose
 from models.selection.trust import Region
-from pipelines import model_store, registry
 from pipelines.cli import app
 from pipelines.commands.predict import as_cell, load_model, predict_batches, predict_file, summary
+from pipelines.store import model_store, registry
 from tests.models.twin_year import recording, two_errors
 from tests.toys.tracked import log_training
 from tests.toys.training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result

@@ -15,11 +15,11 @@ from data.errors import InputError
 from models.protocols import PromotionRule
 from models.selection.promotion import Choice, choose, decide
 from models.selection.trust import Region
-from pipelines import audit, registry, tracking
 from pipelines.commands.predict import load_model
 from pipelines.commands.registry import _print_overview as printed
 from pipelines.commands.registry import overview
 from pipelines.commands.status import _print_models as print_models
+from pipelines.store import audit, registry, tracking
 from tests.toys.tracked import log_training
 from tests.toys.training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
 

@@ -18,7 +18,7 @@ from mlflow.tracking import MlflowClient
 import thermodrift as td
 from data.errors import InputError
 from models.selection.promotion import choose
-from pipelines import audit, registry, runs, tracking
+from pipelines.store import audit, registry, runs, tracking
 from tests.toys.command import Call, in_process
 from tests.toys.tracked import log_training
 from tests.toys.training import machine_yaml, toy_batches, toy_model, toy_result

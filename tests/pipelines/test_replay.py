@@ -18,10 +18,11 @@ from features.rises import zeroed_error_um
 from models.metrics import residual_std_um
 from models.selection.crossing import Plan
 from models.selection.replay import Replay
-from pipelines import model_store, registry, settings, tracking
+from pipelines import settings
 from pipelines.caller import DirectCaller
 from pipelines.commands.replay import replay_year, worth, write_replay_files
-from pipelines.replay import Progress, ReplayRequest, at_home, replay, settings_below
+from pipelines.jobs.replay import Progress, ReplayRequest, at_home, replay, settings_below
+from pipelines.store import model_store, registry, tracking
 from tests.toys.small_year import NOISE_UM, law_um, recording, write_machine
 
 PLAN = Plan(("none",), ("zero", "mlr"), ("leave-batch-out",))
@@ -175,7 +176,7 @@ def test_disturbed_arrivals_end_in_the_same_lake_and_the_same_kind_of_champion(r
 @pytest.mark.slow
 def test_duplicates_change_nothing(recorded: Replay, given: Given, monkeypatch: pytest.MonkeyPatch) -> None:
     """With copies as the only disturbance, every champion and every error is that of the year as recorded."""
-    import pipelines.replay as module
+    import pipelines.jobs.replay as module
     from models.selection.replay import Arrival
 
     def twice(ids: Any, seed: int | None = None) -> tuple[Arrival, ...]:

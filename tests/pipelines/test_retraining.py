@@ -18,7 +18,7 @@ SMALL: dict[str, Any] = {"channels": ["z"], "selectors": ["none"], "families": [
 @pytest.fixture
 def retraining(flows: ModuleType) -> ModuleType:
     """Imported after the environment of Prefect is set."""
-    from pipelines import retraining as module
+    from pipelines.fleet import retraining as module
 
     return module
 

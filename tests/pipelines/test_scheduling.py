@@ -16,11 +16,11 @@ from pathlib import Path
 import pytest
 
 from data.errors import InputError
-from pipelines import fleet_state, scheduling
-from pipelines.fleet import Fleet, FleetMachine, When
-from pipelines.fleet_service import alone, local_timezone
-from pipelines.folders import Folders
-from pipelines.scheduling import Clock, Scheduler
+from pipelines.fleet import fleet_state, scheduling
+from pipelines.fleet.fleet_file import Fleet, FleetMachine, When
+from pipelines.fleet.folders import Folders
+from pipelines.fleet.scheduling import Clock, Scheduler
+from pipelines.fleet.service import alone, local_timezone
 from tests.toys.small_year import write_machine
 
 ROOT = Path(__file__).parents[2]
@@ -278,7 +278,8 @@ def test_turns_and_next_dates_are_kept(tmp_path: Path, said: list[str]) -> None:
 def test_it_waits_in_little_memory() -> None:
     """The process that waits imports neither pandas nor mlflow, prefect or torch."""
     code = (
-        "import sys; import pipelines.commands.schedule, pipelines.fleet_service, pipelines.folders, pipelines.alerts\n"
+        "import sys; import pipelines.commands.schedule\n"
+        "from pipelines.fleet import alerts, folders, service\n"
         "print(sorted({'pandas', 'numpy', 'mlflow', 'prefect', 'torch', 'sklearn'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)

@@ -18,13 +18,14 @@ from mlflow.tracking import MlflowClient
 
 from data.errors import WorkError
 from models.selection.crossing import Plan
-from pipelines import registry, settings, spool, tracking
+from pipelines import settings
 from pipelines.caller import DirectCaller
 from pipelines.commands.train import training_dict
-from pipelines.recordings import home_lake
-from pipelines.request import TrainRequest
-from pipelines.store import StoreOutage
-from pipelines.training import promote_waiting, train
+from pipelines.jobs.recordings import home_lake
+from pipelines.jobs.request import TrainRequest
+from pipelines.jobs.training import promote_waiting, train
+from pipelines.store import registry, spool, tracking
+from pipelines.store.database import StoreOutage
 from tests.toys.command import Call, in_process
 from tests.toys.mlflow_server import MlflowServer
 from tests.toys.postgres import free_port

@@ -16,8 +16,8 @@ from mlflow.tracking import MlflowClient
 from data.errors import InputError, WorkError
 from models.protocols import PromotionRule
 from models.selection.promotion import judged
-from pipelines import audit, runs, tracking
 from pipelines.settings import NamesPart, Settings
+from pipelines.store import audit, runs, tracking
 from tests.toys.tracked import log_training
 from tests.toys.training import toy_batches, toy_result
 

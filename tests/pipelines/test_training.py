@@ -16,12 +16,12 @@ from data.errors import InputError
 from data.lake import Lake
 from models import FAMILIES
 from models.selection.crossing import Plan
-from pipelines import registry, tracking
 from pipelines.caller import DirectCaller
 from pipelines.commands.predict import predict_file
-from pipelines.recordings import load_batches
-from pipelines.request import TrainRequest
-from pipelines.training import TrainOutcome, promote_tracked, train
+from pipelines.jobs.recordings import load_batches
+from pipelines.jobs.request import TrainRequest
+from pipelines.jobs.training import TrainOutcome, promote_tracked, train
+from pipelines.store import registry, tracking
 from tests.toys.small_year import NOISE_UM, law_um, write_machine, write_year
 
 NAME = "small-train"

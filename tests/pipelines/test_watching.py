@@ -20,13 +20,16 @@ from features.rises import zeroed_error_um
 from models.metrics import residual_std_um
 from models.selection.crossing import Plan
 from models.selection.trust import farthest, watched
-from pipelines import fleet_state, model_store, registry, settings, training, watching
-from pipelines.alerts import fleet_view
+from pipelines import settings
 from pipelines.caller import DirectCaller
 from pipelines.commands.status import newest_reports
-from pipelines.fleet import Fleet, FleetMachine
-from pipelines.recordings import home_lake, load_batches
-from pipelines.request import TrainRequest
+from pipelines.fleet import fleet_state, watching
+from pipelines.fleet.alerts import fleet_view
+from pipelines.fleet.fleet_file import Fleet, FleetMachine
+from pipelines.jobs import training
+from pipelines.jobs.recordings import home_lake, load_batches
+from pipelines.jobs.request import TrainRequest
+from pipelines.store import model_store, registry
 from tests.toys.command import in_process
 from tests.toys.small_year import recording, write_machine, write_year
 
@@ -188,7 +191,7 @@ def test_a_home_that_cannot_be_written_is_read_all_the_same(place: Place, monkey
 
     (place.home / "fleet" / f"{NAME}.state.json").unlink(missing_ok=True)
     monkeypatch.setattr(watching, "write_atomic", refused)
-    monkeypatch.setattr("pipelines.fleet_state.write_atomic", refused)
+    monkeypatch.setattr("pipelines.fleet.fleet_state.write_atomic", refused)
     assert {s["channel"] for s in watching.refresh(place.settings)["channels"]} == {"x", "z"}
 
 

@@ -31,8 +31,8 @@ def home(tmp_path_factory: pytest.TempPathFactory, copied_stores: None) -> Itera
 def job(name: str, targets: tuple[str, ...] = ()) -> Any:
     from pipelines import settings
     from pipelines.caller import DirectCaller
-    from pipelines.request import TrainRequest
-    from pipelines.training import train
+    from pipelines.jobs.request import TrainRequest
+    from pipelines.jobs.training import train
 
     if not (DATA / name).is_dir():
         pytest.skip(f"no ../shared/data/{name}")

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 from filelock import FileLock
 
-from pipelines import settings, store, tracking
+from pipelines import settings
+from pipelines.store import database, tracking
 
 
 def empty_store(folders: pytest.TempPathFactory) -> Path:
@@ -31,11 +32,11 @@ def empty_store(folders: pytest.TempPathFactory) -> Path:
 @contextmanager
 def copied_stores(empty: Path) -> Iterator[None]:
     """Every home whose store this process makes gets a copy of the empty one instead of a migration."""
-    make = store.make
+    make = database.make
 
     def copy(file: Path, fill: Callable[[Path], Any]) -> None:
         make(file, (lambda made: shutil.copy(empty, made)) if fill.__module__ == tracking.__name__ else fill)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(store, "make", copy)
+        patch.setattr(database, "make", copy)
         yield

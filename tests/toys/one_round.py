@@ -25,8 +25,8 @@ def write_fleet(path: Path, machine: Path, recordings: Path) -> Path:
 
 
 def main() -> None:
-    from pipelines.fleet import load_fleet
-    from pipelines.fleet_service import local_timezone, serve_fleet
+    from pipelines.fleet.fleet_file import load_fleet
+    from pipelines.fleet.service import local_timezone, serve_fleet
     from pipelines.home import home
 
     serve_fleet(load_fleet(Path(sys.argv[1]), local_timezone()), home(), lambda text: print(text, flush=True), rounds=1)

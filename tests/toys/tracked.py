@@ -11,8 +11,8 @@ from typing import Any
 from data.batch import Batch
 from diagnosis.result import Diagnosis
 from models.selection.result import GridResult
-from pipelines import tracking
 from pipelines.settings import Settings
+from pipelines.store import tracking
 
 
 def log_training(

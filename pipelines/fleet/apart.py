@@ -1,7 +1,7 @@
-"""The process of its own that `pipelines.scheduling` starts for a run, and for the check of a fleet.
+"""The process of its own that `pipelines.fleet.scheduling` starts for a run, and for the check of a fleet.
 
-    python -m pipelines.apart check < FLEET     what is wrong with a fleet, as JSON
-    python -m pipelines.apart run < JOB         one retraining; its outcome is written to the job's file
+    python -m pipelines.fleet.apart check < FLEET     what is wrong with a fleet, as JSON
+    python -m pipelines.fleet.apart run < JOB         one retraining; its outcome is written to the job's file
 
 A process per run keeps the one that waits small, and an error, however bad, with the machine that caused it.
 """
@@ -20,15 +20,15 @@ from uuid import UUID
 from data.errors import InputError, WorkError
 from data.files import write_atomic
 from pipelines import stopping
-from pipelines.fleet import Fleet, FleetMachine
+from pipelines.fleet.fleet_file import Fleet, FleetMachine
 
 
 def check(fleet: Fleet) -> dict[str, Any]:
     """What is wrong with a fleet's machine files: `problems`; folders that are not there now: `notes`; the names of the
     machines; the schema of a run's parameters, where a Prefect server needs it."""
-    from pipelines.fleet_service import has_server
+    from pipelines.fleet.service import has_server
     from pipelines.home import home
-    from pipelines.request import check_request, request_for
+    from pipelines.jobs.request import check_request, request_for
     from pipelines.settings import load
 
     settings = load()
@@ -51,7 +51,7 @@ def check(fleet: Fleet) -> dict[str, Any]:
 def _schema() -> dict[str, Any]:
     from prefect.utilities.callables import parameter_schema
 
-    from pipelines.retraining import retrain
+    from pipelines.fleet.retraining import retrain
 
     return parameter_schema(retrain).model_dump()
 
@@ -61,7 +61,7 @@ def run(machine: FleetMachine, flow_run_id: str | None) -> dict[str, Any]:
     from pipelines.prefect_server import start_server
 
     starting = start_server() if flow_run_id is None else None  # comes up while the rest is imported
-    from pipelines.retraining import finished, retrain
+    from pipelines.fleet.retraining import finished, retrain
 
     try:
         if flow_run_id is not None:
@@ -84,7 +84,7 @@ def _run_scheduled(flow_run_id: UUID) -> None:
     from prefect.client.orchestration import get_client
     from prefect.flow_engine import run_flow
 
-    from pipelines.retraining import retrain
+    from pipelines.fleet.retraining import retrain
 
     with get_client(sync_client=True) as client:
         flow_run = client.read_flow_run(flow_run_id)
@@ -104,7 +104,7 @@ def main(what: str) -> None:
     job = json.loads(text)
     machine = FleetMachine.from_plain(job["machine"])
     outcome = run(machine, job["flow_run_id"])
-    from pipelines import watching
+    from pipelines.fleet import watching
 
     try:
         watching.refresh(load())

@@ -3,7 +3,7 @@
 fleet/KEY.schedule.json   a fleet: its file, next dates, last turns, which of them did not end; KEY.lock is held while a
                           process serves it
 fleet/MACHINE.run.json    a machine's last run and its last failure
-fleet/MACHINE.state.json  its champions, their drift and the state of its sensors, see `pipelines.watching`
+fleet/MACHINE.state.json  its champions, their drift and the state of its sensors, see `pipelines.fleet.watching`
 fleet/MACHINE.alerts.json the alerts that were last reported
 fleet/MACHINE.log         what its last run printed
 """
@@ -20,7 +20,7 @@ from urllib.parse import quote
 from filelock import FileLock, Timeout
 
 from data.files import write_atomic
-from pipelines.fleet import Fleet
+from pipelines.fleet.fleet_file import Fleet
 
 
 def folder_of(home: Path) -> Path:

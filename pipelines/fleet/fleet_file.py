@@ -1,6 +1,6 @@
 """The fleet file: the machines of one scheduling process, when each is retrained and how, and what raises an alert.
 
-What is checked here needs the fleet file alone; `pipelines.retraining` checks it against the machine files, in a
+What is checked here needs the fleet file alone; `pipelines.fleet.retraining` checks it against the machine files, in a
 process of its own, because the process that waits should stay small.
 """
 
@@ -170,7 +170,7 @@ class FleetMachine:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Those of the flow `pipelines.retraining.retrain`."""
+        """Those of the flow `pipelines.fleet.retraining.retrain`."""
         lists = {k: list(getattr(self, k)) for k in ("recordings", "channels", "families", "selectors")}
         return {"machine_file": self.file, "effort": self.effort, **lists}
 

@@ -31,11 +31,11 @@ from models import FAMILIES
 from models.protocols import PromotionRule
 from models.selection.promotion import judged, left_out
 from models.selection.result import GridResult
-from pipelines import spool, tracking
 from pipelines.caller import RETRIES, Caller, DirectCaller, Done, Say
-from pipelines.inputs import INPUTS, Inputs
-from pipelines.recordings import Gathered, check_recordings, gather_batches
+from pipelines.jobs.inputs import INPUTS, Inputs
+from pipelines.jobs.recordings import Gathered, check_recordings, gather_batches
 from pipelines.settings import Settings, home
+from pipelines.store import spool, tracking
 from reports.diagnosis.first_screen import Continued
 from twin.compile import compile_network
 from twin.schema import Calibrated

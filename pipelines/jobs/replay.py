@@ -6,7 +6,7 @@ does it; every run is predicted by the champion that is in force when it arrives
     OUT/home/           lake, tracking store and artifacts of this replay alone
     OUT/progress.json   what is done; the same command goes on from there
 
-The trainings are those of `pipelines.training.train` with `only_if_new`, which a schedule calls as well.
+The trainings are those of `pipelines.jobs.training.train` with `only_if_new`, which a schedule calls as well.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from features.rises import zeroed_error_um
 from models.metrics import residual_std_um
 from models.selection.crossing import Plan
 from models.selection.replay import Arrival, Replay, Retraining, Run, arrivals
-from pipelines import model_store, registry, tracking
-from pipelines.audit import CHAMPION
 from pipelines.caller import Caller, Done, Say
-from pipelines.recordings import check_recordings
-from pipelines.request import TrainRequest, check_request
+from pipelines.jobs.recordings import check_recordings
+from pipelines.jobs.request import TrainRequest, check_request
+from pipelines.jobs.training import TrainOutcome, train
 from pipelines.settings import DiagnoseRule, Settings
-from pipelines.training import TrainOutcome, train
+from pipelines.store import model_store, registry, tracking
+from pipelines.store.audit import CHAMPION
 
 ARRIVALS, PROGRESS = "arrivals.json", "progress.json"
 _SCALE = 10.0  # of errors that are "scaled": micrometres that were exported as tenths
@@ -101,7 +101,7 @@ def check_replay(request: ReplayRequest, settings: Settings) -> tuple[Machine, t
     """The machine and the error channels.
 
     Raises:
-        InputError: see `pipelines.request.check_request`; or numbers that make no replay.
+        InputError: see `pipelines.jobs.request.check_request`; or numbers that make no replay.
     """
     check_recordings(request.recordings)
     for name, value, least in (("--start", request.start, 2), ("--every", request.every, 1)):

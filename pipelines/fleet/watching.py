@@ -21,15 +21,15 @@ from typing import TYPE_CHECKING, Any
 
 from data.errors import InputError, WorkError
 from data.files import write_atomic
-from pipelines import fleet_state
 from pipelines.caller import Say
+from pipelines.fleet import fleet_state
 from pipelines.home import home
 
 if TYPE_CHECKING:
     from data.batch import Batch
     from data.lake import Lake
-    from pipelines.model_store import StoredModel
     from pipelines.settings import Settings
+    from pipelines.store.model_store import StoredModel
 
 SCHEMA = "thermodrift.status/2"
 KEPT_RUNS = 20  # of each channel, the newest
@@ -87,9 +87,9 @@ def refresh(settings: Settings, say: Say = lambda text: None) -> dict[str, Any]:
     Raises:
         WorkError: the store or the lake does not answer.
     """
-    from pipelines import registry, tracking
     from pipelines.console import records
-    from pipelines.recordings import home_lake
+    from pipelines.jobs.recordings import home_lake
+    from pipelines.store import registry, tracking
 
     lake = home_lake()
     tracking.open_store(settings, say)  # the first use takes seconds
@@ -117,9 +117,9 @@ def refresh(settings: Settings, say: Say = lambda text: None) -> dict[str, Any]:
 
 def _champions(settings: Settings) -> dict[str, list[Champion]]:
     """Champions by machine."""
-    from pipelines import audit
-    from pipelines.runs import registered_models
-    from pipelines.tracking import open_store, store_errors
+    from pipelines.store import audit
+    from pipelines.store.runs import registered_models
+    from pipelines.store.tracking import open_store, store_errors
 
     client, found = open_store(settings), dict[str, list[Champion]]()
     with store_errors(settings):
@@ -158,8 +158,8 @@ def _machine(
 def _gathered(
     settings: Settings, lake: Lake, machine: str, champions: Sequence[Champion], recorded: bool
 ) -> list[dict[str, Any]]:
-    from pipelines import model_store, registry
-    from pipelines.recordings import load_batches
+    from pipelines.jobs.recordings import load_batches
+    from pipelines.store import model_store, registry
 
     models: dict[str, StoredModel] = {}
     trouble: dict[str, str] = {}
@@ -193,7 +193,7 @@ def _channel(
     lake, oldest first, with their distance from the trained region in widths and, where they are newer than the
     training, the champion's S; `sensors`: channels without usable values in them; `unknown`: why something could not be
     found out."""
-    from pipelines.tracking import load_training
+    from pipelines.store.tracking import load_training
 
     ids, starts = set[str](), list[str]()
     if c.version is not None:

@@ -32,8 +32,8 @@ from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 
 from data.errors import InputError, WorkError
 from pipelines.caller import Say
-from pipelines.runs import artifact_folder
 from pipelines.settings import Settings, masked
+from pipelines.store.runs import artifact_folder
 
 ANSWER_S = 10  # to accept a connection
 POSTGRESQL = "postgresql"

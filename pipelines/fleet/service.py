@@ -18,11 +18,11 @@ from filelock import FileLock, Timeout
 
 from data.endings import ending
 from data.errors import InputError, WorkError
-from pipelines import fleet_state
 from pipelines.caller import Say
-from pipelines.fleet import Fleet
-from pipelines.folders import Folders
-from pipelines.scheduling import TRIES, Clock, Scheduler, started_apart
+from pipelines.fleet import fleet_state
+from pipelines.fleet.fleet_file import Fleet
+from pipelines.fleet.folders import Folders
+from pipelines.fleet.scheduling import TRIES, Clock, Scheduler, started_apart
 
 
 def local_timezone() -> str:
@@ -87,7 +87,7 @@ def serve_fleet(fleet: Fleet, home: Path, say: Say, rounds: int | None = None) -
         again = [name for name, (_, tries) in fleet_state.unfinished(home, fleet).items() if tries < TRIES]
         with folders.watching():
             if has_server(home):
-                from pipelines.deployments import Deployments
+                from pipelines.fleet.deployments import Deployments
 
                 with Deployments(fleet, schema, folders, say, again) as source:
                     say(_first_line(fleet, f"as scheduled by {source.url}"))

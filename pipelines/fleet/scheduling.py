@@ -1,9 +1,10 @@
 """The process that waits for the machines of a fleet and has each retrained in a process of its own.
 
 It decides nothing about models and imports little: what comes due is a `Source` (dates and watched folders here, a
-Prefect server in `pipelines.deployments`), what a run does is in `pipelines.apart`. One run per machine at a time, the
-longest waiting first: too many machines for one computer are each retrained less often. A date that passes while a run
-goes on, or while this process does not run, is caught up once, and so is a run that ended with this process.
+Prefect server in `pipelines.fleet.deployments`), what a run does is in `pipelines.fleet.apart`. One run per machine at
+a time, the longest waiting first: too many machines for one computer are each retrained less often. A date that passes
+while a run goes on, or while this process does not run, is caught up once, and so is a run that ended with this
+process.
 """
 
 from __future__ import annotations
@@ -22,20 +23,20 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from data.endings import ending
-from pipelines import alerts, fleet_state
 from pipelines.caller import Say
-from pipelines.fleet import Fleet, FleetMachine
-from pipelines.folders import Folders
+from pipelines.fleet import alerts, fleet_state
+from pipelines.fleet.fleet_file import Fleet, FleetMachine
+from pipelines.fleet.folders import Folders
 
 TICK_S = 1.0
 NEVER = datetime.min.replace(tzinfo=UTC)
 TRIES = 2  # of a turn that ended with this process: what ends twice may be what ends this process
-APART = (sys.executable, "-m", "pipelines.apart")
+APART = (sys.executable, "-m", "pipelines.fleet.apart")
 END_S = 2.5  # for a run to end after SIGTERM; an operator waits 5 s for all of it
 
 
 def started_apart(what: str, line: str, **streams: Any) -> subprocess.Popen[str]:
-    """The process of `pipelines.apart` that does `what` with a line of JSON.
+    """The process of `pipelines.fleet.apart` that does `what` with a line of JSON.
 
     Its standard input stays open: it ends when that closes, at the latest with this process.
     """

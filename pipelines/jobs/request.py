@@ -1,4 +1,4 @@
-"""What to train, and whether that is possible; apart from `pipelines.training`, whose imports take seconds."""
+"""What to train, and whether that is possible; apart from `pipelines.jobs.training`, whose imports take seconds."""
 
 from __future__ import annotations
 

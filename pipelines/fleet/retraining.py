@@ -12,9 +12,9 @@ from data.errors import InputError, WorkError
 from data.machine import load_machine
 from pipelines.caller import LANES
 from pipelines.flows import PrefectCaller, link_report, log_to_server
-from pipelines.request import request_for
+from pipelines.jobs.request import request_for
+from pipelines.jobs.training import TrainOutcome, train
 from pipelines.settings import load
-from pipelines.training import TrainOutcome, train
 
 finished: list[str] = []  # summaries of this process: known even where Prefect loses its server at the end of a run
 

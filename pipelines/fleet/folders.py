@@ -11,7 +11,7 @@ from pathlib import Path
 from watchfiles import watch
 
 from pipelines.caller import Say
-from pipelines.fleet import Fleet
+from pipelines.fleet.fleet_file import Fleet
 
 LOOK_AGAIN_S = 30.0  # for folders that were not there
 

@@ -28,7 +28,7 @@ from models.base import Family, family_from_plain
 from models.selection.conformal import RunBound
 from models.selection.trust import SLACK, Region, disagreement_um, farthest, watched
 from models.selection.updating import Updater
-from pipelines.audit import CHAMPION
+from pipelines.store.audit import CHAMPION
 
 SCHEMA = "thermodrift.model/3"
 _READABLE = ("thermodrift.model/2", SCHEMA)  # /2 had no bounds of a run

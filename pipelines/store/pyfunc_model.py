@@ -22,12 +22,12 @@ _SLACK = 0.05  # of a region's width, as in models.selection.trust
 
 
 class CompensationModel(PythonModel):
-    """See `pipelines.model_store.predict_frame`."""
+    """See `pipelines.store.model_store.predict_frame`."""
 
     def load_context(self, context: PythonModelContext) -> None:
         folder = Path(context.artifacts["model.json"]).parent
         try:
-            from pipelines import model_store
+            from pipelines.store import model_store
         except ImportError:
             self.predict_frame = Served(folder).predict
             return

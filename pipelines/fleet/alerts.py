@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from pipelines import fleet_state, watching
 from pipelines.caller import Say
-from pipelines.fleet import AlertRules, Fleet
+from pipelines.fleet import fleet_state, watching
+from pipelines.fleet.fleet_file import AlertRules, Fleet
 
 TIMEOUT_S = 10.0
 WEBHOOK = "THERMODRIFT_WEBHOOK"

@@ -23,8 +23,8 @@ from compensation.safety import ROOM, Limits
 from data.batch import Batch
 from data.errors import InputError
 from features.rises import feature_unit
-from pipelines.model_store import FILES, StoredModel, inner_folder, is_champion, load
 from pipelines.settings import home
+from pipelines.store.model_store import FILES, StoredModel, inner_folder, is_champion, load
 
 PERIOD_S = 10.0  # of the models: castings move in minutes, and a step costs a tenth of a millisecond
 _LOST_SAMPLES = 3  # in a row before the input is stale

@@ -30,8 +30,8 @@ from mlflow.entities.model_registry import ModelVersion, RegisteredModel
 from mlflow.tracking import MlflowClient
 from pydantic import BaseModel, ConfigDict
 
-from pipelines.audit import who
 from pipelines.settings import Settings
+from pipelines.store.audit import who
 
 PARENT = "mlflow.parentRunId"
 _DIGEST_LENGTH = 36  # the store's limit; the whole digest goes into a tag

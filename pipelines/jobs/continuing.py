@@ -15,9 +15,9 @@ from data.files import check_folder
 from data.machine import Machine, load_machine, parse_machine
 from diagnosis.findings.schema import read_findings
 from pipelines.caller import RETRIES, Caller, DirectCaller, Done, Say
-from pipelines.diagnosing import FILES, FINDINGS, PLAN, Diagnose, DiagnosisOutcome, DiagnosisRequest, finished
-from pipelines.inputs import Inputs, Recorded, read_inputs
-from pipelines.recordings import Gathered, check_recordings, gather_batches, home_lake, load_batches
+from pipelines.jobs.diagnosing import FILES, FINDINGS, PLAN, Diagnose, DiagnosisOutcome, DiagnosisRequest, finished
+from pipelines.jobs.inputs import Inputs, Recorded, read_inputs
+from pipelines.jobs.recordings import Gathered, check_recordings, gather_batches, home_lake, load_batches
 from pipelines.settings import Settings
 from reports.diagnosis.first_screen import Continued
 from twin.run_plan import RunPlan, load_run_plan

@@ -31,18 +31,19 @@ from models.selection.race import Job, Raced, drive
 from models.selection.result import GridResult, Training
 from models.selection.trust import Region, left_out_runs
 from models.selection.updating import updated_scores
-from pipelines import registry, spool, stopping, tracking
+from pipelines import stopping
 from pipelines.caller import RETRIES, Caller, Say
-from pipelines.checkpoint import Checkpoint
-from pipelines.recordings import check_channels, home_lake, load_batches
-from pipelines.request import TrainRequest, check_request
-from pipelines.runs import Record, code_version, now_ms
+from pipelines.jobs.recordings import check_channels, home_lake, load_batches
+from pipelines.jobs.request import TrainRequest, check_request
 from pipelines.settings import Settings, home
-from pipelines.store import StoreOutage
+from pipelines.store import registry, spool, tracking
+from pipelines.store.checkpoint import Checkpoint
+from pipelines.store.database import StoreOutage
+from pipelines.store.runs import Record, code_version, now_ms
 from reports.comparison import figure_pngs, write_report
 
 if TYPE_CHECKING:
-    from pipelines.diagnosing import DiagnosisOutcome
+    from pipelines.jobs.diagnosing import DiagnosisOutcome
 
 
 @dataclass(repr=False)
@@ -82,7 +83,8 @@ def train(
     """Run the yearly job.
 
     The tracking store is reached first, and gets what waits for it. Every result is kept before it is delivered (see
-    `pipelines.spool`), so that nothing is lost if the store goes away. After any other failure the crossing is kept.
+    `pipelines.store.spool`), so that nothing is lost if the store goes away. After any other failure the crossing is
+    kept.
 
     Args:
         caller: how the steps run.
@@ -156,7 +158,7 @@ def train(
     checkpoint.remove()
     stopping.note(None)
     if machine.twin is not None:
-        from pipelines import diagnosing  # its imports take seconds, and most trainings need none
+        from pipelines.jobs import diagnosing  # its imports take seconds, and most trainings need none
 
         diagnose = partial(
             diagnosing.diagnose_if_grown, request.machine_file, ids=outcome.training_ids, settings=settings, say=say
@@ -325,7 +327,7 @@ def _hand_over(
     fill: Callable[[Path], object],
     promote: spool.Promote[registry.Promotion] | None = None,
 ) -> None:
-    """A result of a channel to the store; after an outage of it the result only waits, see `pipelines.spool`."""
+    """A result of a channel to the store; after an outage of it the result only waits, see `pipelines.store.spool`."""
     record = outcome.records[target]
     if outcome.postponed:
         spool.keep(settings, kind, record, fill)

@@ -37,9 +37,10 @@ from models.selection.outlook import Outlook, outlook
 from models.selection.promotion import Choice, Comparison, compare_paired, left_out
 from models.selection.result import GridResult
 from models.selection.trust import Region
-from pipelines import audit, fitted_model, model_store, pyfunc_model, store
-from pipelines.audit import CHAMPION, PROVISIONAL
-from pipelines.runs import (
+from pipelines.settings import Settings
+from pipelines.store import audit, database, fitted_model, model_store, pyfunc_model
+from pipelines.store.audit import CHAMPION, PROVISIONAL
+from pipelines.store.runs import (
     close_interrupted,
     code_version,
     model_versions,
@@ -47,8 +48,7 @@ from pipelines.runs import (
     standing_versions,
     versions_by_model,
 )
-from pipelines.settings import Settings
-from pipelines.tracking import load_training, open_store, record_promotion, store_errors
+from pipelines.store.tracking import load_training, open_store, record_promotion, store_errors
 
 _MODEL_PACKAGES = ("mlflow", "numpy", "pandas", "scipy", "scikit-learn", "pydantic", "PyYAML")
 _SERVED_PACKAGES = ("mlflow", "numpy", "pandas", "onnxruntime")  # of a family that is an ONNX file
@@ -515,7 +515,7 @@ def _locked(name: str, settings: Settings) -> Iterator[None]:
     """One process at a time changes a model's versions and aliases."""
     folder = settings.home / "locks"
     folder.mkdir(parents=True, exist_ok=True)
-    with FileLock(folder / f"{name}.lock"), store.exclusive(settings, name), store_errors(settings):
+    with FileLock(folder / f"{name}.lock"), database.exclusive(settings, name), store_errors(settings):
         yield
 
 
@@ -550,7 +550,7 @@ def _log_version(client: MlflowClient, name: str, new: Newcomer, tags: dict[str,
 
     Models from code: MLflow keeps `pyfunc_model.py` and the plain files of `model_store`; nothing is pickled.
     """
-    from pipelines.serving import write_served  # loads onnx
+    from pipelines.store.serving import write_served  # loads onnx
 
     choice, result, info = new.choice, new.result, _info(new)
     tags = {k: _text(v) for k, v in info.items() if k not in ("choice", "faults")} | _tags(new) | tags

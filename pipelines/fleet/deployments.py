@@ -30,16 +30,16 @@ from prefect.settings import (
 from prefect.states import Cancelled, Crashed, Pending
 
 from pipelines.caller import Say
-from pipelines.fleet import Fleet, FleetMachine
-from pipelines.folders import Folders
-from pipelines.scheduling import Job
+from pipelines.fleet.fleet_file import Fleet, FleetMachine
+from pipelines.fleet.folders import Folders
+from pipelines.fleet.scheduling import Job
 
 if TYPE_CHECKING:
     from prefect.client.orchestration import SyncPrefectClient
     from prefect.client.schemas.responses import DeploymentResponse, FlowRunResponse
 
 FLOW = "thermodrift-retrain"
-ENTRYPOINT = "pipelines.retraining.retrain"
+ENTRYPOINT = "pipelines.fleet.retraining.retrain"
 POLL_S = 5.0
 LOST_POLL_S = 10.0  # while the server does not answer
 LOST_AFTER_S = 15.0  # a server under load drops a connection now and then

@@ -1,4 +1,5 @@
-"""The files by which a stored model is served where thermodrift is not installed, see `pipelines.pyfunc_model`."""
+"""The files by which a stored model is served where thermodrift is not installed, see
+`pipelines.store.pyfunc_model`."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from compensation.exports.onnx_graph import OnnxExport
 from compensation.safety import Limits
 from data.errors import InputError
 from models.program import Program
-from pipelines.model_store import SERVED, StoredModel, add_hashes
+from pipelines.store.model_store import SERVED, StoredModel, add_hashes
 
 
 def write_served(stored: StoredModel, folder: Path, step_s: float) -> tuple[str, ...]:

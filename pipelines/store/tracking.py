@@ -37,10 +37,12 @@ from models.protocols import PromotionRule
 from models.selection.outlook import outlook
 from models.selection.promotion import Choice, choose, judged
 from models.selection.result import GridResult, Training
-from pipelines import store
-from pipelines.audit import CHAMPION
 from pipelines.caller import Say
-from pipelines.runs import (
+from pipelines.settings import Settings, load, masked
+from pipelines.store import database
+from pipelines.store.audit import CHAMPION
+from pipelines.store.database import StoreOutage
+from pipelines.store.runs import (
     DIAGNOSIS,
     Entity,
     Record,
@@ -53,8 +55,6 @@ from pipelines.runs import (
     write_record,
     yes_or_no,
 )
-from pipelines.settings import Settings, load, masked
-from pipelines.store import StoreOutage
 
 if TYPE_CHECKING:
     from diagnosis.result import Diagnosis
@@ -80,16 +80,16 @@ def open_store(settings: Settings, say: Say = lambda text: None) -> MlflowClient
     """
     file = settings.store_file
     with _OPENING, store_errors(settings):
-        if file is not None and not store.is_made(file):
+        if file is not None and not database.is_made(file):
             say(f"first use: making the tracking store {file} (takes some seconds, once)")
-            store.make(file, lambda made: MlflowClient(f"sqlite:///{made}").search_experiments(max_results=1))
+            database.make(file, lambda made: MlflowClient(f"sqlite:///{made}").search_experiments(max_results=1))
         own = settings.artifacts_uri
-        if file is not None and own and settings.store_uri not in _opened and store.follow(file, own):
+        if file is not None and own and settings.store_uri not in _opened and database.follow(file, own):
             say(f"the home has moved: addresses in the tracking store now lead to {own}")
         # MLflow looks up a logged model's files in the process-wide store, whatever store is requested.
         mlflow.set_tracking_uri(settings.store_uri)
         mlflow.set_registry_uri(settings.store_uri)
-        with store.first_use(settings, say) if settings.store_uri not in _opened else nullcontext():
+        with database.first_use(settings, say) if settings.store_uri not in _opened else nullcontext():
             client = MlflowClient(settings.store_uri, registry_uri=settings.store_uri)
             client.search_experiments(max_results=1)
         _opened.add(settings.store_uri)

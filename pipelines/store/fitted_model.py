@@ -24,7 +24,7 @@ from models.selection.conformal import RunBound
 from models.selection.crossing import unfitted, with_target
 from models.selection.trust import Region
 from models.selection.updating import Updater, left_out_tracks, out_of_fold
-from pipelines import model_store
+from pipelines.store import model_store
 
 
 def write(

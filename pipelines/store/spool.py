@@ -26,10 +26,10 @@ from data.errors import InputError, WorkError
 from data.files import whole_folder
 from data.lakefile import safe_name
 from pipelines.caller import Say
-from pipelines.runs import Record, find_record
 from pipelines.settings import Settings
-from pipelines.store import StoreOutage
-from pipelines.tracking import attach, log_record, open_store, store_errors
+from pipelines.store.database import StoreOutage
+from pipelines.store.runs import Record, find_record
+from pipelines.store.tracking import attach, log_record, open_store, store_errors
 
 MACHINE = "machine.yml"  # the machine file of a promotion
 _ITEM, _FILES, _REASON = "item.json", "files", "reason.txt"

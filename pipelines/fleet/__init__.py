@@ -1,0 +1,1 @@
+"""Many machines: the fleet file, its schedule, the state of every machine and its alerts."""
