@@ -33,8 +33,8 @@ from models import FAMILIES
 from models.metrics import residual_std_um
 from models.protocols import forward
 from models.selection.updating import COUNTS, SCHEDULES, Track, Updater, out_of_fold, scores
-from plants.sample.sample_axis import write_sample_axis
 from thermodrift_exam.plants.plant import draw
+from thermodrift_exam.plants.types.lathe_axis import write_sample_axis
 
 MACHINES = Path(__file__).parent.parent / "machines"
 LAGS = ("lag30min", "lag120min")

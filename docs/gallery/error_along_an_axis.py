@@ -12,7 +12,7 @@ from matplotlib import colormaps
 
 import thermodrift as td
 from docs.gallery.drawing import picture
-from plants.sample.sample_axis import write_sample_axis
+from thermodrift_exam.plants.types.lathe_axis import write_sample_axis
 
 MACHINE = Path(__file__).parents[2] / "machines" / "sample_lathe.yml"
 

@@ -16,7 +16,7 @@ from data.errors import InputError
 from data.machine import Machine, parse_machine
 from data.peek import look
 from data.recording import read_batches, recording_files
-from plants.sample.sample_axis import write_sample_axis
+from thermodrift_exam.plants.types.lathe_axis import write_sample_axis
 
 
 def run(seed: int, n: int = 400) -> pd.DataFrame:

@@ -23,12 +23,12 @@ from models.selection.trust import Region
 from pipelines.commands.predict import predict_file
 from pipelines.jobs.request import TrainRequest, check_request
 from pipelines.store import model_store
-from plants.sample.sample_axis import write_sample_axis
 from reports.comparison import figure_pngs, write_report
 from reports.comparison.channel import left_out_panel
 from reports.comparison.tables import left_out_batches
 from tests.reports.test_report_browser import CHROMIUM, console, measured, open_page
 from tests.toys.report_training import settings, training
+from thermodrift_exam.plants.types.lathe_axis import write_sample_axis
 
 pytestmark = pytest.mark.drawn
 MACHINE_FILE = Path(__file__).parents[2] / "machines" / "sample_lathe.yml"

@@ -18,9 +18,9 @@ from features.design import Design
 from features.rises import zeroed_error_um
 from models.families.axis_coupled import AxisCoupled
 from models.families.mlr import MLR
-from plants.sample.runs import MACHINE_SHARE, ROOM
-from plants.sample.sample_axis import POSITIONS, SENSOR_OFFSET_K, write_sample_axis
-from plants.sample.sample_lathe import AXES, LATHE
+from thermodrift_exam.plants.types.lathe import AXES, LATHE
+from thermodrift_exam.plants.types.lathe_axis import POSITIONS, SENSOR_OFFSET_K, write_sample_axis
+from thermodrift_exam.plants.types.runs import MACHINE_SHARE, ROOM
 from thermodrift_exam.studies.base import Figure, Inputs, Ordering, Study, choices, predictions_um
 
 RUNS, CLUSTERS = 9, 4

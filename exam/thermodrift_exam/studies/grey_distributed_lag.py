@@ -13,8 +13,8 @@ from models.families.distributed_lag import DistributedLag
 from models.families.gm1n import GM1N
 from models.families.gm_dl import GMDL
 from models.families.ridge import Ridge
-from plants.sample.runs import SimulatedRun
-from plants.sample.types import VMC, VMC_SENSORS
+from thermodrift_exam.plants.types.machines import VMC, VMC_SENSORS
+from thermodrift_exam.plants.types.runs import SimulatedRun
 from thermodrift_exam.studies.base import Figure, Ordering, Study, choices, predictions_um, residual_stds_um
 
 SAMPLE_S, RUN_S, POINTS = 300.0, 6 * 3600.0, 4

@@ -14,8 +14,8 @@ from models.families.bp import BP
 from models.families.gm1n import GM1N
 from models.families.grey_models import sequence_outputs
 from models.families.lssvm import LSSVM
-from plants.sample.runs import SimulatedRun
-from plants.sample.types import HMC
+from thermodrift_exam.plants.types.machines import HMC
+from thermodrift_exam.plants.types.runs import SimulatedRun
 from thermodrift_exam.studies.base import Figure, Ordering, Study
 
 SENSORS = tuple(HMC.sensors)

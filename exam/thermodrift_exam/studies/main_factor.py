@@ -14,8 +14,8 @@ from features.selectors.statistics import ranking
 from models.base import Family
 from models.families.bp import BP
 from models.families.ridge import Ridge
-from plants.sample.runs import SimulatedRun
-from plants.sample.types import LATHE, LATHE_SENSORS
+from thermodrift_exam.plants.types.machines import LATHE, LATHE_SENSORS
+from thermodrift_exam.plants.types.runs import SimulatedRun
 from thermodrift_exam.studies.base import Figure, Inputs, Ordering, Study, choices, predictions_um, residual_stds_um
 
 CHANNELS = {"x": "x_spindle", "z": "z_spindle"}

@@ -16,8 +16,8 @@ from models.families.bp import BP
 from models.families.mlr import MLR
 from models.families.pcr import PCR
 from models.families.ridge import Ridge
-from plants.sample.runs import Scatter, SimulatedRun
-from plants.sample.types import VMC, VMC_SENSORS
+from thermodrift_exam.plants.types.machines import VMC, VMC_SENSORS
+from thermodrift_exam.plants.types.runs import Scatter, SimulatedRun
 from thermodrift_exam.studies.base import (
     Figure,
     Inputs,

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from data.arrays import Array
 from data.errors import InputError
-from plants.sample.runs import Scatter, SimulatedRun
-from plants.sample.sample_lathe import AXES, LATHE, SLOW_BODIES, Drive, feed_heat_W
 from plants.sample.sample_year import (
     FRICTION_SCATTER,
     PROBE_NOISE_UM,
@@ -30,6 +28,8 @@ from plants.sample.sample_year import (
     sensor_degC,
 )
 from plants.sample.thermal_machine import ThermalMachine
+from thermodrift_exam.plants.types.lathe import AXES, LATHE, SLOW_BODIES, Drive, feed_heat_W
+from thermodrift_exam.plants.types.runs import Scatter, SimulatedRun
 
 SPEEDS_RPM, FEEDS_MM_PER_MIN = (1000, 1500, 2000), (500, 1000, 1500)
 POSITIONS = 12

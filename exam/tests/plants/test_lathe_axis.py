@@ -16,10 +16,17 @@ from data.machine import Machine, load_machine
 from data.recording import read_batches
 from models.selection.crossing import Plan
 from models.selection.grid import run_grid
-from plants.sample.sample_axis import COLUMNS, POSITIONS, SENSOR_OFFSET_K, axis_runs, run_lathe, write_sample_axis
-from plants.sample.sample_lathe import AXES, LATHE, STEEL_UM_PER_M_K, Drive, feed_heat_W
+from thermodrift_exam.plants.types.lathe import AXES, LATHE, STEEL_UM_PER_M_K, Drive, feed_heat_W
+from thermodrift_exam.plants.types.lathe_axis import (
+    COLUMNS,
+    POSITIONS,
+    SENSOR_OFFSET_K,
+    axis_runs,
+    run_lathe,
+    write_sample_axis,
+)
 
-MACHINE = Path(__file__).parents[2] / "machines" / "sample_lathe.yml"
+MACHINE = Path(__file__).parents[3] / "machines" / "sample_lathe.yml"
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from plants.sample import sample_machine
-from plants.sample.runs import ROOM, MachineType
-from plants.sample.sample_lathe import AXES, SLOW_BODIES, Drive, feed_heat_W
-from plants.sample.sample_lathe import LATHE as SAMPLE_LATHE
 from plants.sample.sample_machine import IRON_UM_PER_M_K, STEEL_UM_PER_M_K
 from plants.sample.thermal_machine import BearingSet, SpeedHeat, ThermalMachine
+from thermodrift_exam.plants.types.lathe import AXES, SLOW_BODIES, Drive, feed_heat_W
+from thermodrift_exam.plants.types.lathe import LATHE as SAMPLE_LATHE
+from thermodrift_exam.plants.types.runs import ROOM, MachineType
 
 COLUMN_HEIGHT_M, COLUMN_DEPTH_M = 0.9, 0.6
 

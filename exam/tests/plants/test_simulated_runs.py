@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from data.errors import InputError
-from plants.sample.runs import MachineType, Scatter, SimulatedRun
-from plants.sample.types import HMC, LATHE, VMC
+from thermodrift_exam.plants.types.machines import HMC, LATHE, VMC
+from thermodrift_exam.plants.types.runs import MachineType, Scatter, SimulatedRun
 
 TYPES = {"vmc": VMC, "hmc": HMC, "lathe": LATHE}
 STAGES = ((300.0, 0.0), (3600.0, 2000.0), (600.0, 0.0))
