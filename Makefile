@@ -4,7 +4,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 FREEZE := $(BIN)/pip freeze --all --exclude-editable | grep -v '^pip==' | sed 's/+cpu$$//' | sort -f
 
-.PHONY: run test test-exam lint docs gallery prove bench clean lock
+.PHONY: run test test-exam test-slow lint docs gallery prove bench clean lock
 
 # The diagnosis works on one core, so the demonstration runs while the training does; its lines follow at the end.
 run: $(READY)  ## the main job on the built-in sample year, and a sealed demonstration of the diagnosis
@@ -19,6 +19,9 @@ test: $(READY)  ## with bytecode, since many tests start processes
 EXAM ?= exam/tests
 test-exam: $(READY)  ## those of the examination, which no user at a machine runs
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(EXAM)
+
+test-slow: $(READY)  ## those of both that take minutes, more than an hour on two cores; before a release
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist load -m slow tests exam/tests
 
 lint: $(READY)
 	$(BIN)/ruff check .

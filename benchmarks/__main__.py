@@ -119,7 +119,7 @@ def on_gpu(batches: Sequence[Batch], repeats: int) -> Iterator[Row]:
     """Training of each sequence net on a GPU, next to the processor: all batches but one, error z."""
     import torch
 
-    from models import FAMILIES
+    from models.families import FAMILIES
 
     if not torch.cuda.is_available():
         yield Row("nets on a GPU", reference="the same on the processor", note="not run (no GPU)")

@@ -22,7 +22,7 @@ from compensation.safety import Limits
 from compensation.substitutes import Substitutes
 from data.batch import Batch
 from features.design import Design
-from models import FAMILIES
+from models.families import FAMILIES
 from models.selection.trust import Region
 from models.selection.updating import Updater, out_of_fold
 from tests.conftest import make_toy_batches

@@ -30,8 +30,8 @@ from data.arrays import Array
 from data.batch import Batch
 from data.machine import Machine
 from features.rises import zeroed_error_um
-from models import FAMILIES
 from models.base import Family
+from models.families import FAMILIES
 from models.metrics import residual_std_um
 from models.protocols import PromotionRule
 from models.selection.crossing import Plan, unfitted

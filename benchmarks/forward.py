@@ -32,7 +32,7 @@ from data.errors import InputError
 from data.machine import Machine, load_machine
 from data.recording import read_batches
 from features.design import Design
-from models import FAMILIES
+from models.families import FAMILIES
 from models.metrics import residual_std_um
 from models.protocols import PROTOCOLS, Fold, folds_of
 from plants.sample.sample_year import write_sample_year

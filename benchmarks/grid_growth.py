@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.table import exponent
 from features.design import Design
-from models import FAMILIES
+from models.families import FAMILIES
 from models.families.linear import Blocks
 from models.protocols import Fold
 from models.selection.judging import FamilyScores

@@ -21,8 +21,8 @@ from sklearn.svm import SVR
 
 from data.arrays import Array
 from features.design import Design
-from models import FAMILIES
 from models.base import inner_groups
+from models.families import FAMILIES
 from models.numerics.kernels import Rows, evenly, unit_scale
 from models.numerics.trees import training_rows
 

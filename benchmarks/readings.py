@@ -29,7 +29,7 @@ from data.machine import load_machine
 from data.recording import read_batches
 from features.design import Design
 from features.rises import temperature_inputs
-from models import FAMILIES
+from models.families import FAMILIES
 from models.metrics import residual_std_um
 from models.protocols import forward
 from models.selection.updating import COUNTS, SCHEDULES, Track, Updater, out_of_fold, scores

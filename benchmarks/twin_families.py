@@ -29,8 +29,8 @@ from data.batch import Batch
 from data.machine import Machine, load_machine, parse_machine
 from data.recording import read_batches
 from features.design import Design
-from models import FAMILIES
 from models.base import Family
+from models.families import FAMILIES
 from models.metrics import batch_scores
 from models.protocols import Fold, leave_batch_out, leave_season_out
 from plants.sample.sample_year import write_sample_year

@@ -1,9 +1,9 @@
 """2. A family of your own: one class in one file, one line in the registry.
 
 In the project the class would be `models/families/nearest_batch.py` and the line
-`"nearest_batch": "models.families.nearest_batch:NearestBatch"` in `models/__init__.py`; here both are made on the spot.
-From then on the grid crosses it, the report ranks it and the tests over the registry check it. The same checks run on a
-class that is in no registry: `td.testing.check_family`.
+`"nearest_batch": "models.families.nearest_batch:NearestBatch"` in `models/families/__init__.py`; here both are made on
+the spot. From then on the grid crosses it, the report ranks it and the tests over the registry check it. The same
+checks run on a class that is in no registry: `td.testing.check_family`.
 """
 
 from collections.abc import Sequence
@@ -51,16 +51,16 @@ if __name__ == "__main__":
     import tempfile
     from pathlib import Path
 
-    import models
     from data.machine import load_machine
     from data.recording import read_batches
+    from models.families import FAMILIES
     from models.selection.crossing import Plan
     from models.selection.grid import run_grid
     from plants.sample.sample_year import write_sample_year
     from thermodrift.testing import check_family
 
     check_family(NearestBatch)  # a failed check says what was expected, what came and why it matters
-    models.FAMILIES.add("nearest_batch", f"{__name__}:NearestBatch")
+    FAMILIES.add("nearest_batch", f"{__name__}:NearestBatch")
 
     machine = load_machine(Path(__file__).parent.parent / "machines" / "sample_vmc.yml")
     with tempfile.TemporaryDirectory() as folder:

@@ -219,7 +219,7 @@ def _mechanism(m: Any) -> list[str]:
 
 def selectors_and_families_page() -> str:
     from features.selectors import SELECTORS
-    from models import FAMILIES
+    from models.families import FAMILIES
 
     lines = ["# Selectors and model families", "", NOTE, ""]
     lines += ["All compete in every `thermodrift train --effort`, but for what is marked *on request*.", ""]

@@ -1,6 +1,6 @@
 """Base class of the model families.
 
-To add one: a class below `Family` in a file of its own and a line in `models/__init__.py`. It needs
+To add one: a class below `Family` in a file of its own and a line in `models/families/__init__.py`. It needs
 `fit_design` and `respond`, or `fit_folds` and `respond_folds` where many folds share work. Predictions are 0 at a
 batch's start whatever `respond` gives there; `started` is the design that such a model is to be fitted on.
 """
@@ -189,7 +189,7 @@ class Family(ABC):
         Raises:
             InputError: the family has no such form.
         """
-        from models import FAMILIES
+        from models.families import FAMILIES
 
         those = [key for key, family in FAMILIES.items() if family.has_program()]
         raise InputError(f"family {self.key} cannot be written as a program; those that can: {', '.join(those)}")
@@ -225,7 +225,7 @@ def family_from_plain(plain: Plain) -> Family:
     Raises:
         InputError: unknown family key.
     """
-    from models import FAMILIES
+    from models.families import FAMILIES
 
     family: Family = FAMILIES[plain["family"]](**plain["options"])
     family.inputs, family.target = tuple(plain["inputs"]), plain["target"]

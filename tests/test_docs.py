@@ -23,7 +23,7 @@ TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
 
 @pytest.fixture(autouse=True)
 def _registry_as_before(monkeypatch):
-    from models import FAMILIES
+    from models.families import FAMILIES
 
     monkeypatch.setattr(FAMILIES, "_members", dict(FAMILIES._members))
 
@@ -140,7 +140,7 @@ def test_every_registered_member_has_its_place_in_the_reference(build) -> None:
     from compensation.exports import EXPORTS
     from data.checks import CHECKS
     from features.selectors import SELECTORS
-    from models import FAMILIES
+    from models.families import FAMILIES
     from twin.mechanisms import MECHANISMS
 
     made = build.pages()

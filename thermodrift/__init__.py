@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from data.lake import Lake
     from data.machine import load_machine
     from features.selectors import SELECTORS
-    from models import FAMILIES
+    from models.families import FAMILIES
     from models.selection.crossing import Plan
     from thermodrift.api import (
         calibrate,
@@ -48,7 +48,7 @@ __all__ = [
     "rehearse", "replay", "sample_year", "save_model", "simulate", "testing", "train",
 ]  # fmt: skip
 _MODULES = {
-    "CalibrationOptions": "twin.calibration", "FAMILIES": "models", "Lake": "data.lake",
+    "CalibrationOptions": "twin.calibration", "FAMILIES": "models.families", "Lake": "data.lake",
     "MECHANISMS": "twin.mechanisms", "Plan": "models.selection.crossing", "SELECTORS": "features.selectors",
     "load_machine": "data.machine",
 }  # fmt: skip

@@ -1,1 +1,40 @@
-"""Model families, one file each, and what several of them are made of."""
+"""Registry of model families, one file each, and what several of them are made of."""
+
+from data.registry import Registry
+
+FAMILIES = Registry(
+    "family",
+    {
+        "zero": "models.families.baselines:Zero",
+        "mean_curve": "models.families.baselines:MeanCurve",
+        "thermal_exponential": "models.families.thermal_exponential:ThermalExponential",
+        "twin": "models.families.twin:Twin",
+        "twin_residual": "models.families.twin_residual:TwinResidual",
+        "twin_kalman": "models.families.twin_kalman:TwinKalman",
+        "mlr": "models.families.mlr:MLR",
+        "ridge": "models.families.ridge:Ridge",
+        "pcr": "models.families.pcr:PCR",
+        "pcr_lbo": "models.families.pcr:PCRByLeaveBatchOut",
+        "pls": "models.families.pls:PLS",
+        "elastic_net": "models.families.elastic_net:ElasticNet",
+        "huber": "models.families.huber:Huber",
+        "distributed_lag": "models.families.distributed_lag:DistributedLag",
+        "lag_dictionary": "models.families.lag_dictionary:LagDictionary",
+        "axis_coupled": "models.families.axis_coupled:AxisCoupled",
+        "bp": "models.families.bp:BP",
+        "bp_linear": "models.families.bp:BPLinear",
+        "lstm": "models.families.recurrent:LSTM",
+        "gru": "models.families.recurrent:GRU",
+        "tcn": "models.families.tcn:TCN",
+        "lssvm": "models.families.lssvm:LSSVM",
+        "svr": "models.families.svr:SVR",
+        "gm1n": "models.families.gm1n:GM1N",
+        "transfer_function": "models.families.transfer_function:TransferFunction",
+        "gm_lssvm": "models.families.gm_lssvm:GMLSSVM",
+        "gaussian_process": "models.families.gaussian_process:GaussianProcess",
+        "random_forest": "models.families.random_forest:RandomForest",
+        "hist_gradient_boosting": "models.families.hist_gradient_boosting:HistGradientBoosting",
+        "gm_dl": "models.families.gm_dl:GMDL",
+        "stack": "models.selection.stack:Stack",
+    },
+)

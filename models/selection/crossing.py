@@ -24,8 +24,8 @@ from features.rises import temperature_inputs
 from features.selectors import SELECTORS
 from features.selectors.statistics import training_statistics
 from features.stability import tsp_stability
-from models import FAMILIES
 from models.base import Family
+from models.families import FAMILIES
 from models.protocols import PROTOCOLS, Fold, folds_of, forward_obstacle, placed
 from models.selection.judging import KEPT, FamilyScores, score_table
 from models.selection.result import CELL_KEYS

@@ -17,7 +17,7 @@ from data.processes import Processes, Shared, in_threads, one_thread
 from features.selectors import SELECTORS
 from features.selectors.base import Diagnostic
 from features.stability import stability_over_batches
-from models import FAMILIES
+from models.families import FAMILIES
 from models.protocols import Fold, season, speed, start_ambient_degC
 from models.selection.crossing import Crossing, FamilyResult, Plan, prepare
 from models.selection.race import Job, drive

@@ -29,7 +29,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import stdtrit
 
-from models import FAMILIES
+from models.families import FAMILIES
 from models.protocols import Fold
 from models.selection.crossing import Cell, Crossing, FamilyResult, Inputs, cross_family
 from models.selection.loss import BASELINES, cost_of_choosing, paired, pooled

@@ -74,7 +74,7 @@ class Stack(Family):
             raise InputError(f"{self.key}: {error}") from None
 
     def _fitted(self, design: Design, train: Sequence[int]) -> Self:
-        from models import FAMILIES
+        from models.families import FAMILIES
 
         used = [k for k in sorted(train) if np.isfinite(design.y_um[design.rows(k)]).sum() > 1]
         parts, left = [], [(tuple(j for j in used if j != k), (k,)) for k in used]
@@ -125,7 +125,7 @@ class Stack(Family):
 
 def weights_of(runs: Sequence[tuple[Array, Array]], families: Sequence[str]) -> Array:
     """Weights (m,) of the predictions of m families from runs of y (n,) and p (n, m) in µm; their shares for no run."""
-    from models import RECORDS, USUAL_RECORD
+    from models.selection.loss import RECORDS, USUAL_RECORD
 
     share = np.array([RECORDS.get(f, USUAL_RECORD) for f in families]) ** -_SHARPNESS
     share /= share.sum()

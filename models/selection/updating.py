@@ -25,7 +25,7 @@ import pandas as pd
 from data.arrays import Array, Index, Mask
 from data.errors import InputError
 from features.design import Design
-from models import FAMILIES
+from models.families import FAMILIES
 from models.metrics import SIDE_OF_90, residual_std_um
 from models.numerics.kernels import unit_scale
 from models.selection.crossing import Crossing

@@ -137,7 +137,7 @@ def train(
 
     settings.configure_environment()
     from features.selectors import SELECTORS
-    from models import FAMILIES
+    from models.families import FAMILIES
     from models.protocols import PROTOCOLS
     from models.selection.crossing import FINALISTS, Plan
     from pipelines.engine import ENGINES, open_engine

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator,
 from data.errors import InputError, closest
 from data.yaml_file import TimeZone, load_yaml
 from features.selectors import SELECTORS
-from models import FAMILIES
+from models.families import FAMILIES
 
 CRON = "0 5 * * 1"
 SEASON_DAYS = 92.0

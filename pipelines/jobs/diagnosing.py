@@ -27,7 +27,7 @@ from data.machine import Machine, load_machine
 from diagnosis.export.machine_file import diagnosed_text, drafted_text
 from diagnosis.findings.schema import Findings, as_json
 from diagnosis.result import Diagnosis
-from models import FAMILIES
+from models.families import FAMILIES
 from models.protocols import PromotionRule
 from models.selection.promotion import judged, left_out
 from models.selection.result import GridResult

@@ -32,7 +32,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from data.batch import Batch
 from data.errors import InputError, WorkError, place_of
-from models import FAMILIES
+from models.families import FAMILIES
 from models.protocols import PromotionRule
 from models.selection.outlook import outlook
 from models.selection.promotion import Choice, choose, judged

@@ -12,7 +12,7 @@ import pandas as pd
 from data.errors import InputError, check_suffix
 from data.registry import Registry
 from features.selectors import SELECTORS
-from models import FAMILIES
+from models.families import FAMILIES
 from models.protocols import PromotionRule
 from models.selection.result import GridResult, Training
 from reports.comparison import story as records

@@ -15,7 +15,7 @@ from compensation.exports import EXPORTS
 from compensation.exports.base import AxisModel, identifiers
 from data.batch import Batch, Channel
 from data.errors import InputError
-from models import FAMILIES
+from models.families import FAMILIES
 from models.program import Builder, Program, replay
 from thermodrift.testing import ContractCheck, check_export
 from thermodrift.testing.exports import LIMITS, export_of, offset_only, straight

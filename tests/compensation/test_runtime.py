@@ -19,7 +19,7 @@ from compensation.substitutes import Substitutes
 from data.batch import Batch
 from data.errors import InputError
 from features.design import Design
-from models import FAMILIES
+from models.families import FAMILIES
 from models.program import Builder, replay
 from models.selection.conformal import RunBound
 from models.selection.trust import Region, watched

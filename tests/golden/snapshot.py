@@ -31,7 +31,7 @@ from data.machine import Machine, load_machine
 from diagnosis.diagnose import diagnose
 from diagnosis.findings.schema import as_json
 from evidence.sealing.examinee import read_case
-from models import FAMILIES
+from models.families import FAMILIES
 from models.selection.crossing import Plan
 from models.selection.grid import run_grid
 from plants.sample.sample_year import write_sample_year

@@ -12,7 +12,7 @@ from data.batch import Batch, Channel
 from data.errors import InputError
 from data.machine import parse_machine
 from features.design import Design
-from models import FAMILIES
+from models.families import FAMILIES
 from models.families.axis_coupled import AxisCoupled
 from models.families.baselines import MeanCurve
 from models.selection.crossing import Plan, prepare

@@ -14,7 +14,7 @@ import pytest
 
 from data.errors import InputError
 from features.design import Design
-from models import FAMILIES
+from models.families import FAMILIES
 from thermodrift.testing import ContractCheck, check_family, runs
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from data.errors import InputError
 from features.selectors import SELECTORS
-from models import FAMILIES
+from models.families import FAMILIES
 from models.metrics import residual_std_um
 from models.selection.crossing import Plan, prepare, refit
 from models.selection.grid import run_grid

@@ -7,8 +7,8 @@ import pytest
 
 from data.errors import InputError
 from features.design import Design
-from models import FAMILIES
 from models.base import Family
+from models.families import FAMILIES
 from models.families.linear import mean_square
 from models.families.mlr import MLR
 from models.families.pcr import PCR

@@ -11,8 +11,8 @@ import pytest
 
 from data.batch import Batch
 from data.errors import InputError
-from models import FAMILIES
 from models.base import Family
+from models.families import FAMILIES
 from models.program import Program, State, replay
 
 PROGRAMS = [key for key, family in FAMILIES.items() if family.has_program()]

@@ -11,8 +11,8 @@ import pytest
 from data.batch import Batch, Channel
 from data.errors import InputError
 from features.design import Design
-from models import FAMILIES
 from models.base import Family, family_from_plain
+from models.families import FAMILIES
 from models.families.twin import Twin
 from models.families.twin_kalman import TwinKalman
 from models.families.twin_residual import TwinResidual

@@ -20,7 +20,7 @@ from data.errors import InputError
 from data.machine import load_machine
 from data.recording import read_batches
 from features.design import Design
-from models import FAMILIES
+from models.families import FAMILIES
 from models.program import replay
 from models.selection.trust import Region
 from models.selection.updating import Updater, out_of_fold

@@ -142,7 +142,7 @@ def test_a_disk_that_is_full_at_a_step_keeps_the_crossing(
         workers=1,
     )
     point = {
-        "crossing": (checkpoint, "_fill"), "artifacts": (MlflowClient, "log_artifacts"),
+        "crossing": (checkpoint, "_write"), "artifacts": (MlflowClient, "log_artifacts"),
         "report": (tracking, "attach"),
     }[where]  # fmt: skip
     with monkeypatch.context() as patch, pytest.raises(WorkError) as caught:

@@ -10,8 +10,8 @@ import pytest
 import yaml
 
 from data.errors import InputError
-from models import FAMILIES
 from models.base import Family
+from models.families import FAMILIES
 from models.families.twin import Twin
 from models.families.twin_kalman import TwinKalman
 from models.selection.trust import Region

@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 
 from data.errors import InputError
 from data.machine import parse_machine
-from models import FAMILIES
 from models.base import Family
+from models.families import FAMILIES
 from models.families.mlr import MLR
 from models.selection.conformal import RunBound
 from models.selection.promotion import choose

@@ -14,7 +14,7 @@ from mlflow import MlflowClient
 
 from data.errors import InputError
 from data.lake import Lake
-from models import FAMILIES
+from models.families import FAMILIES
 from models.selection.crossing import Plan
 from pipelines.caller import DirectCaller
 from pipelines.commands.predict import predict_file

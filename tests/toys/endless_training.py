@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from features.design import Design
-from models import FAMILIES
+from models.families import FAMILIES
 from models.families.mlr import MLR
 from pipelines.cli import main
 

@@ -48,7 +48,7 @@ def check_family(family: type[Family] | str, *, generate_only: bool = False) -> 
     Raises:
         ContractError: checks failed; each is named.
     """
-    from models import FAMILIES
+    from models.families import FAMILIES
     from thermodrift.testing.families import SUITE, FamilyCase
 
     return SUITE.of(FAMILIES, family, FamilyCase, generate_only)
