@@ -26,7 +26,7 @@ from pipelines.caller import DirectCaller
 from pipelines.jobs.request import TrainRequest
 from pipelines.jobs.training import train
 from pipelines.settings import NamesPart, Settings
-from pipelines.store import checkpoint, database, model_store, registry, tracking
+from pipelines.store import checkpoint, database, model_store, registry, spool, tracking
 from tests.toys.command import in_process
 from tests.toys.small_year import write_machine, write_year
 from tests.toys.tracked import log_training
@@ -143,19 +143,18 @@ def test_a_disk_that_is_full_at_a_step_keeps_the_crossing(
     )
     point = {
         "crossing": (checkpoint, "_write"), "artifacts": (MlflowClient, "log_artifacts"),
-        "report": (tracking, "attach"),
+        "report": (spool, "attach"),
     }[where]  # fmt: skip
     with monkeypatch.context() as patch, pytest.raises(WorkError) as caught:
         patch.setattr(*point, full)
         train(request, store, DirectCaller())
     kept = 0 if where == "crossing" else 2
-    assert "No space left on device" in str(caught.value) and f"; {kept} of 2 families are kept in " in str(
-        caught.value
-    )
+    assert "No space left on device" in str(caught.value)
+    assert f"; {kept} finished parts of the crossing kept in " in str(caught.value)
     assert not list((store_home / "unfinished").glob("*/.writing-*"))
     said: list[str] = []
     outcome = train(request, store, DirectCaller(), said.append)
-    assert any(line.startswith("resumes: 2 of 2") for line in said) == (kept == 2)
+    assert any(line.startswith("resumes: 2 finished parts") for line in said) == (kept == 2)
     assert tracking.trainings(name, None, store)["training_id"].tolist() == [outcome.training_ids["z"]]
 
 

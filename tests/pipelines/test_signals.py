@@ -60,7 +60,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small machine with a promoted model in `promoted`, and recordings of the sample machine in `year`."""
     folder = tmp_path_factory.mktemp("signals")
     write_machine(folder / "m.yml", "small")
-    write_year(folder / "in", 6)
+    write_year(folder / "in", 9)
     for file in write_sample_year(folder / "whole")[::6]:
         (folder / "year").mkdir(exist_ok=True)
         shutil.copy(file, folder / "year")
@@ -100,7 +100,7 @@ ARGUMENTS: dict[str, Callable[[Path], list[object]]] = {
     "status": lambda g: ["status"],
     "compensate": lambda g: ["compensate", "models:/small-z@champion"],
     "rehearse": lambda g: ["rehearse", "models:/small-z@champion", "--recordings", g / "in", "--sample-s", "1"],
-    "describe": lambda g: ["describe", g / "whole", "--out",
+    "describe": lambda g: ["describe", *sorted((g / "whole").glob("*.csv")), "--out",
                             g / f"drafted{time.monotonic_ns()}.yml"],
 }  # fmt: skip
 OF_PROMOTED = {"compensate", "rehearse"}
@@ -128,7 +128,7 @@ CASES: list[tuple[str, str, Moment, int]] = [
     ("schedule run", "server comes up", server, TERM),
     ("schedule run", "in a round", then(unfinished, 0.5), INT),
     ("schedule run", "in a round, terminated", then(unfinished, 2.0), TERM),
-    ("replay", "in a training", unfinished, INT),
+    ("replay", "in a training", printed("grid"), INT),
     ("replay", "promotes", then(printed("promote"), 0.3), TERM),
     ("diagnose", "begins", 4.0, TERM),
     ("diagnose", "workers", then(workers, 4.0), INT),
@@ -139,7 +139,7 @@ CASES: list[tuple[str, str, Moment, int]] = [
     ("demonstrate", "diagnoses", 25.0, TERM),
     ("reproduce", "simulates", 6.0, INT),
     ("reproduce", "workers", then(workers, 6.0), TERM),
-    ("simulate", "writes", 2.5, INT),
+    ("simulate", "writes", 1.5, INT),
     ("status", "first store", then(printed("first use"), 1.0), INT),
     ("status", "imports", 2.0, TERM),
     ("compensate", "waits for samples", 7.0, INT),

@@ -86,13 +86,13 @@ def test_a_signal_ends_all_processes_and_the_next_run_resumes(
     assert wait_for(lambda: not of_session(training.process.pid), 1), of_session(training.process.pid)
     assert (code, seconds < LIMIT_S) == (128 + number, True), (code, seconds, error)
     last = error.splitlines()[-1]
-    assert last.startswith("thermodrift: stopped; 2 of 3 families are kept in ") and "Traceback" not in error
+    assert last.startswith("thermodrift: stopped; 2 finished parts of the crossing kept in ") and "Traceback" not in error
     assert last.endswith("; run the same command to go on")
     assert not list(tmp_path.glob("thermodrift-*"))
     if options and endless == "worker":
         again = Training(tmp_path, *families, *options)
         assert wait_for(lambda: len(of_session(again.process.pid)) > 2 or again.process.poll() is not None, 120)
-        assert "resumes: 2 of 3 families were crossed on 20" in again.stop(signal.SIGTERM, False)[2]
+        assert "resumes: 2 finished parts of the crossing were crossed on 20" in again.stop(signal.SIGTERM, False)[2]
 
 
 def test_a_worker_ends_with_the_process_that_started_it() -> None:
