@@ -10,7 +10,7 @@ all folds, and for `forward` the mean S over the odd blocks (on which settings o
 even blocks (on which they are confirmed). `step` is `forward` with blocks of one run: the last twelve runs of a
 machine with at least 24, each predicted by a model of all runs before it. FOLDER holds lathe_gv1203 and spindle_fl;
 what is missing is skipped. Nothing is asserted. `--records` prints for every family its mean S of later runs over that
-of the best one, the geometric mean over the kinds of machine but the lathe: what `models.RECORDS` holds.
+of the best one, the geometric mean over the kinds of machine but the lathe: what `models.selection.loss.RECORDS` holds.
 """
 
 from __future__ import annotations

@@ -37,11 +37,6 @@ class Shown:
     numbers: tuple[float, ...] = ()
 
 
-def draft_machine_file(files: Sequence[Path], form: Form | None = None) -> str:
-    """YAML text of a machine file for recordings of one machine; see `drafted`."""
-    return drafted(files, form)[0]
-
-
 def drafted(files: Sequence[Path], form: Form | None = None) -> tuple[str, dict[str, list[Shown]]]:
     """YAML text of a machine file for recordings of one machine, and the columns of the first file of each kind.
 

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from data import guess
-from data.describe import draft_machine_file, notes
+from data.describe import drafted, notes
 from data.errors import InputError
 from data.machine import Machine, parse_machine
 from data.peek import look
@@ -40,7 +40,7 @@ def run(seed: int, n: int = 400) -> pd.DataFrame:
 
 
 def draft(files):
-    text = draft_machine_file(files)
+    text = drafted(files)[0]
     return text, parse_machine(text, "draft")
 
 
@@ -145,12 +145,12 @@ def test_files_of_another_kind_are_left_out_and_named(tmp_path):
 
 def test_nothing_to_describe_is_one_clear_line(tmp_path):
     with pytest.raises(InputError, match="describe: no files given"):
-        draft_machine_file([])
+        drafted([])[0]
     (tmp_path / "a.csv").write_text("hello\nworld\n")
     with pytest.raises(InputError, match=r"^a.csv: no table of numbers found; expected a time column and channels"):
-        draft_machine_file([tmp_path / "a.csv"])
+        drafted([tmp_path / "a.csv"])[0]
     with pytest.raises(InputError, match=r"gone\.csv: no such file"):
-        draft_machine_file([tmp_path / "gone.csv"])
+        drafted([tmp_path / "gone.csv"])[0]
 
 
 @pytest.mark.parametrize("step", [0.1, 0.25, 0.02, 1.0, 0.488])
@@ -212,7 +212,7 @@ def test_without_a_clock_the_draft_asks_for_the_step(tmp_path, counter):
     if counter is not None:
         table.insert(0, counter, np.arange(300))
     table.to_csv(tmp_path / "a.csv", index=False)
-    text = draft_machine_file([tmp_path / "a.csv"])
+    text = drafted([tmp_path / "a.csv"])[0]
     assert notes(text) == ["no column is a clock: write the time between two rows as recording.time.step, such as 60 s"]
     with pytest.raises(InputError, match=r"line \d+: key 'recording.time': .*the time between two rows"):
         parse_machine(text, "draft")

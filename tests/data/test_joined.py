@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from data.batch import Batch
-from data.describe import draft_machine_file
+from data.describe import drafted
 from data.errors import InputError
 from data.machine import Machine, parse_machine
 from data.recording import read_batches, recording_files
@@ -172,8 +172,8 @@ def test_a_schedule_without_a_needed_channel_may_be_missing(tmp_path: Path) -> N
 # drafts
 
 
-def drafted(files: list[Path]) -> tuple[str, Machine]:
-    text = draft_machine_file(files)
+def as_drafted(files: list[Path]) -> tuple[str, Machine]:
+    text = drafted(files)[0]
     return text, parse_machine(text, "draft")
 
 
@@ -181,7 +181,7 @@ def test_draft_of_pairs_of_files(tmp_path: Path) -> None:
     for day in ("20240301", "20240302"):
         temperatures("Zeit [min]").assign(**{"Zeit [min]": np.arange(180)}).to_csv(tmp_path / f"temp_{day}.csv")
         errors("Zeit [s]").to_csv(tmp_path / f"weg_{day}.csv", index=False)
-    text, m = drafted(sorted(tmp_path.iterdir()))
+    text, m = as_drafted(sorted(tmp_path.iterdir()))
     assert "left out" not in text
     assert m.recording.files == ["temp_*.csv"] and m.recording.start_from_name == "temp_%Y%m%d"
     assert m.recording.joined["errors"].file == "weg_*.csv" and m.recording.joined["errors"].time.unit == "s"
@@ -196,19 +196,19 @@ def test_draft_of_two_workbooks_and_of_two_sheets(tmp_path: Path) -> None:
         for k in range(2):
             temperatures("Datum", DAY + pd.Timedelta(days=k)).to_excel(b, sheet_name=f"d{k}", index=False)
             errors("Zeit", DAY + pd.Timedelta(days=k)).to_excel(a, sheet_name=f"d{k}", index=False)
-    _, m = drafted([tmp_path / "A.xlsx", tmp_path / "B.xlsx"])
+    _, m = as_drafted([tmp_path / "A.xlsx", tmp_path / "B.xlsx"])
     assert m.recording.files == ["B.xlsx"] and m.recording.joined["errors"].file == "A.xlsx"
     assert [x.start for x in read_batches(tmp_path / "B.xlsx", m)] == [DAY, DAY + pd.Timedelta(days=1)]
     with pd.ExcelWriter(tmp_path / "days.xlsx") as book:
         for day in ("2024-03-01", "2024-03-02"):
             temperatures("t_s").merge(errors("t_s"), "left").to_excel(book, sheet_name=day, index=False)
-    _, m = drafted([tmp_path / "days.xlsx"])
+    _, m = as_drafted([tmp_path / "days.xlsx"])
     days = [x.start for x in read_batches(tmp_path / "days.xlsx", m)]
     assert days == [pd.Timestamp("2024-03-01"), pd.Timestamp("2024-03-02")]
     with pd.ExcelWriter(tmp_path / "one.xlsx") as book:
         temperatures().to_excel(book, sheet_name="T", index=False)
         errors().to_excel(book, sheet_name="probe", index=False)
-    _, m = drafted([tmp_path / "one.xlsx"])
+    _, m = as_drafted([tmp_path / "one.xlsx"])
     assert m.recording.joined["errors"].sheet == "probe"
     assert only(tmp_path / "one.xlsx", m).repairs["joined_rows"] == 45
 
@@ -218,7 +218,7 @@ def test_draft_of_one_file_of_errors_for_all_recordings(tmp_path: Path) -> None:
     for k, day in enumerate(days):
         temperatures("stamp", day).to_csv(tmp_path / f"log{k}.csv", index=False)
     pd.concat([errors("when", day) for day in days]).to_csv(tmp_path / "probe.csv", index=False)
-    _, m = drafted(sorted(tmp_path.iterdir()))
+    _, m = as_drafted(sorted(tmp_path.iterdir()))
     assert (m.recording.joined["errors"].by, m.recording.joined["errors"].file) == ("time", "probe.csv")
     files, _ = recording_files(tmp_path, m)
     assert [b.start for f in files for b in read_batches(f, m)] == days
@@ -230,7 +230,7 @@ def test_a_table_that_belongs_to_no_recording_is_left_out(tmp_path: Path) -> Non
     pd.DataFrame({"batch": [20240301, 20240302, 20240303], "rpm": [1000, 3000, 2000]}).to_csv(
         tmp_path / "runs.csv", index=False
     )
-    text, m = drafted(sorted(tmp_path.iterdir()))
+    text, m = as_drafted(sorted(tmp_path.iterdir()))
     assert (
         m.recording.joined == {} and "# left out: runs.csv: its columns are others than those of 20240301.csv" in text
     )

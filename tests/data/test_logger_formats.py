@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from data.batch import Batch
-from data.describe import draft_machine_file, drafted, notes
+from data.describe import drafted, notes
 from data.errors import InputError
 from data.machine import Form, Machine, parse_machine
 from data.recording import read_batches
@@ -97,7 +97,7 @@ def saved(folder: Path, name: str, lines: Lines, encoding: str = "utf-8") -> Pat
 
 
 def drafted_machine(*paths: Path) -> Machine:
-    return parse_machine(draft_machine_file(paths), "draft")
+    return parse_machine(drafted(paths)[0], "draft")
 
 
 def read(path: Path, text: str) -> Batch:
@@ -109,7 +109,7 @@ def read(path: Path, text: str) -> Batch:
 def test_a_draft_reads_its_own_file(tmp_path: Path, name: str) -> None:
     lines, encoding, dated = FORMATS[name]
     path = saved(tmp_path, name, lines, encoding)
-    text = draft_machine_file([path])
+    text = drafted([path])[0]
     assert not any("ingest" in note for note in notes(text))
     batch = read(path, text)
     assert batch.start is None if not dated else abs(batch.start - START) <= pd.Timedelta("123ms")
@@ -200,7 +200,7 @@ def test_a_clock_contradicted_by_its_keys() -> None:
 
 def test_a_time_in_no_known_format_is_named(tmp_path: Path) -> None:
     path = saved(tmp_path, "a.csv", [HEAD, *rows("day 3 hour {i}:xx,{f},{b},{z}")])
-    (note, *_) = notes(draft_machine_file([path]))
+    (note, *_) = notes(drafted([path])[0])
     assert note.startswith("column 'Time' (a time in no known format, such as 'day 3 hour 1:xx'): set recording.time")
 
 
@@ -238,7 +238,7 @@ def test_one_long_recording_is_cut_into_runs(
 ) -> None:
     path = tmp_path / "year.csv"
     long_recording(3, pause_s).to_csv(path, index=False)
-    text = with_split(draft_machine_file([path]), split)
+    text = with_split(drafted([path])[0], split)
     for block in (1 << 20, 300):
         monkeypatch.setattr("data.readers.csv._BLOCK_BYTES", block)
         batches = list(read_batches(path, parse_machine(text, "draft")))
@@ -251,7 +251,7 @@ def test_one_long_recording_is_cut_into_runs(
 def test_a_draft_proposes_how_to_cut_one_long_recording(tmp_path: Path, pause_s: float, proposed: str) -> None:
     path = tmp_path / "year.csv"
     long_recording(3, pause_s).to_csv(path, index=False)
-    text = draft_machine_file([path])
+    text = drafted([path])[0]
     (line,) = [x for x in text.splitlines() if "# split:" in x]
     assert proposed in line and "3 runs" in line
     proposal = line.strip().removeprefix("# split: ").partition("  #")[0]
@@ -267,14 +267,14 @@ def test_a_line_that_says_simulated_marks_the_machine(tmp_path: Path) -> None:
 
 def test_without_an_error_the_draft_says_how_to_name_one(tmp_path: Path) -> None:
     path = saved(tmp_path, "a.csv", ["Time,T1,T2", *rows("{t},{f},{b}")])
-    (note,) = notes(draft_machine_file([path]))
+    (note,) = notes(drafted([path])[0])
     assert note.startswith("no channel is the measured error; set role: error and its unit where it is, such as T1, T2")
 
 
 def test_errors_without_a_clock_are_joined_row_by_row(tmp_path: Path) -> None:
     warm = saved(tmp_path, "temperatures.csv", ["Time,T1,T2", *rows("{t:%Y-%m-%d %H:%M:%S},{f},{b}")])
     error = saved(tmp_path, "errors.csv", ["z_um", *rows("{z}")])
-    text = draft_machine_file([warm, error])
+    text = drafted([warm, error])[0]
     machine = parse_machine(text, "draft")
     assert machine.recording.files == ["temperatures.csv"] and machine.recording.joined["errors"].time.step == "60 s"
     assert np.array_equal(read(warm, text).values("z_um"), Z)
@@ -283,7 +283,7 @@ def test_errors_without_a_clock_are_joined_row_by_row(tmp_path: Path) -> None:
 def test_files_of_other_columns_are_not_in_the_pattern(tmp_path: Path) -> None:
     first = saved(tmp_path, "warm.csv", ["time_s,T1,z_um", *rows("{s},{f},{z}")])
     other = saved(tmp_path, "notes.csv", ["time_s,T1", *rows("{s},{f}")])
-    text = draft_machine_file([first, other])
+    text = drafted([first, other])[0]
     assert parse_machine(text, "draft").recording.files == ["warm.csv"] and "# left out: notes.csv" in text
 
 

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from data.batch import Batch
-from data.describe import draft_machine_file
+from data.describe import drafted
 from data.errors import InputError
 from data.lake import Lake
 from data.machine import load_machine
@@ -176,7 +176,7 @@ def test_the_files_of_a_fresh_user(call: Call, tmp_path: Path) -> None:
     assert back.simulated and back.step_s == machine.recording.step_s and back.start is None
     assert back.labels["plan"] == "Rotating-spindle test at 4000 rpm" and back.labels["thermodrift"]
     np.testing.assert_allclose(back.values("bed")[10], plain["bed"][285:316].mean(), atol=1e-3)
-    draft = draft_machine_file([out / "iso_spindle_test.parquet"])
+    draft = drafted([out / "iso_spindle_test.parquet"])[0]
     assert "role: driver" in draft and "time: {column: time_s, unit: s}" in draft
 
     done = call("ingest", out / "iso_spindle_test.parquet", "--machine", SAMPLE)

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from data.batch import Batch
-from data.describe import draft_machine_file, notes
+from data.describe import drafted, notes
 from data.ingest import ingest
 from data.lake import Lake
 from data.machine import Machine, parse_machine
@@ -51,7 +51,7 @@ def ingested(path: Path, machine: Machine, tmp_path: Path) -> Batch:
 def test_a_draft_reads_its_own_file(name: str, tmp_path: Path) -> None:
     start, channels = READINGS[name]
     truth = pd.read_csv(LOGGERS / "truth.csv")
-    text = draft_machine_file([LOGGERS / name])
+    text = drafted([LOGGERS / name])[0]
     assert not any("ingest" in note for note in notes(text))
     batch = ingested(LOGGERS / name, parse_machine(text, "draft"), tmp_path)
     assert batch.start == start
@@ -66,7 +66,7 @@ def test_a_draft_reads_its_own_file(name: str, tmp_path: Path) -> None:
 
 def test_local_times_over_the_start_of_summer_time(tmp_path: Path) -> None:
     path = LOGGERS / "dst_spring.csv"
-    text = draft_machine_file([path])
+    text = drafted([path])[0]
     (note,) = notes(text)
     assert "the clock jumps by an hour at 2025-03-30 02:00" in note and "recording.timezone" in note
     with_zone = text.replace("  header: true\n", "  header: true\n  timezone: Europe/Berlin\n")
@@ -76,9 +76,9 @@ def test_local_times_over_the_start_of_summer_time(tmp_path: Path) -> None:
 
 
 def test_what_is_doubtful_is_asked_for() -> None:
-    assert notes(draft_machine_file([LOGGERS / "units_unknown.csv"])) == [
+    assert notes(drafted([LOGGERS / "units_unknown.csv"])[0]) == [
         "load_kg (kg): taken for drivers; set role: error if one is measured"
     ]
-    assert notes(draft_machine_file([LOGGERS / "weight.csv"])) == [
+    assert notes(drafted([LOGGERS / "weight.csv"])[0]) == [
         "W_raw_kg (kg) is taken for the measured error; else set its role"
     ]

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from data.describe import draft_machine_file
+from data.describe import drafted
 from data.machine import parse_machine
 from data.recording import read_batches, recording_files
 
@@ -82,7 +82,7 @@ FILES = ["lathe_gv1203/20200[67]*.csv", "spindle_fl/*.csv", "tclab/hybrid_mimo.c
 @pytest.mark.parametrize("pattern", FILES)
 def test_draft_of_a_machine_file_reads_its_own_files(pattern):
     files = sorted(REAL.glob(pattern))
-    machine = parse_machine(draft_machine_file(files), pattern)
+    machine = parse_machine(drafted(files)[0], pattern)
     assert set(files) <= set(recording_files(files[0].parent, machine)[0])
     for path in files[:3]:
         (batch,) = read_batches(path, machine)
@@ -92,7 +92,7 @@ def test_draft_of_a_machine_file_reads_its_own_files(pattern):
 
 
 def test_draft_of_the_lathe_finds_roles_and_units():
-    machine = parse_machine(draft_machine_file(sorted(REAL.glob("lathe_gv1203/*.csv"))), "lathe")
+    machine = parse_machine(drafted(sorted(REAL.glob("lathe_gv1203/*.csv")))[0], "lathe")
     assert machine.recording.time.unit == "min"
     assert machine.names("error") == ("Disp_X", "Disp_Z")
     assert len(machine.names("temperature")) == 24
