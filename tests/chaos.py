@@ -124,6 +124,8 @@ def _become(home: Path, log: Path, argv: list[str]) -> NoReturn:
     handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     os.dup2(handle, 1)
     os.dup2(handle, 2)
+    # a test captures the ones before
+    sys.stdout, sys.stderr = (os.fdopen(fd, "w", encoding="utf-8", closefd=False) for fd in (1, 2))
     os.environ |= {"THERMODRIFT_HOME": str(home), "TMPDIR": str(home.parent)}
     tempfile.tempdir = None
     sys.argv = argv
@@ -403,7 +405,7 @@ class Chaos:
         wrong += [*broken_now(known), *(differs(known, reference) if "unreadable" not in known else ())]
         if lost := set(before) - set(known.get("trainings", {})):
             wrong.append(("trainings", f"vanished: {sorted(lost)}"))
-        resumed = f"resumes: {len(FAMILIES)} of {len(FAMILIES)}" in said or "nothing new to learn" in said
+        resumed = f"resumes: {len(FAMILIES)} finished parts" in said or "nothing new to learn" in said
         if kept == len(FAMILIES) and not resumed and self.key != "schedule":  # a scheduled run prints its summary alone
             wrong.append(("grid again", said[-400:]))
         phase = lines[-1][:80] if lines else "start"
