@@ -20,7 +20,7 @@ EXAM ?= exam/tests
 test-exam: $(READY)  ## those of the examination, which no user at a machine runs
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(EXAM)
 
-test-slow: $(READY)  ## those of both that take minutes, more than an hour on two cores; before a release
+test-slow: $(READY)  ## those of both that take minutes, about 35 on two cores; before a release
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist load -m slow tests exam/tests
 
 lint: $(READY)

@@ -145,12 +145,12 @@ def test_files_of_another_kind_are_left_out_and_named(tmp_path):
 
 def test_nothing_to_describe_is_one_clear_line(tmp_path):
     with pytest.raises(InputError, match="describe: no files given"):
-        drafted([])[0]
+        drafted([])
     (tmp_path / "a.csv").write_text("hello\nworld\n")
     with pytest.raises(InputError, match=r"^a.csv: no table of numbers found; expected a time column and channels"):
-        drafted([tmp_path / "a.csv"])[0]
+        drafted([tmp_path / "a.csv"])
     with pytest.raises(InputError, match=r"gone\.csv: no such file"):
-        drafted([tmp_path / "gone.csv"])[0]
+        drafted([tmp_path / "gone.csv"])
 
 
 @pytest.mark.parametrize("step", [0.1, 0.25, 0.02, 1.0, 0.488])

@@ -80,7 +80,8 @@ def test_the_spindle_recording_is_clean() -> None:
 
 
 @pytest.mark.slow
-def test_minutes_read_as_seconds_mask_hardly_a_sensor_of_the_lathe() -> None:
+@pytest.mark.xfail(reason="PT09 is masked in 5 of 32 runs and X in one; nothing names the time unit", strict=True)
+def test_minutes_read_as_seconds_mask_no_good_sensor_of_the_lathe() -> None:
     if not LATHE.is_dir():
         pytest.skip("no ../shared/data/lathe_gv1203")
     given = load_machine(ROOT / "machines" / "lathe_gv1203.yml")
@@ -89,6 +90,7 @@ def test_minutes_read_as_seconds_mask_hardly_a_sensor_of_the_lathe() -> None:
     machine = given.model_copy(update={"recording": recording})
     found = [checked(b, machine) for f in sorted(LATHE.glob("20*.csv")) for b in read_batches(f, machine)]
     batches = check_machine(found, machine)
-    masked = [f.channel for b in batches for f in b.findings if f.masks and f.check == "jump_no_return"]
-    assert "PT10" in masked  # it is broken in one run
-    assert len(masked) < 0.01 * sum(len(b.channels) for b in batches)
+    masked = {f.channel for b in batches for f in b.findings if f.masks and f.check == "jump_no_return"}
+    noted = [f for b in batches for f in b.findings if not f.masks and f.check == "jump_no_return"]
+    assert masked == {"PT10"} and len(noted) > 50
+    assert all("probably the time unit (recording.time.unit: s)" in f.message for f in noted)
