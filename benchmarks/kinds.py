@@ -1,17 +1,17 @@
 """Does the diagnosis hold on machines of other kinds?
 
     python -m benchmarks.kinds --kinds lathe board --cases 12 --out var/kinds
-    python -m benchmarks.kinds --paired 808000 --table results/diagnosis_kinds.csv
-    python -m benchmarks.kinds --paired 840000 --noises 6 --claims results/claims.csv
+    python -m benchmarks.kinds --paired 870000 --table results/diagnosis_kinds.csv
+    python -m benchmarks.kinds --paired 700000 --claims results/claims.csv
 
-Draws cases of the proof for every kind (nothing missing, one effect, an effect of no list), diagnoses each, and prints
-by kind: effects named first (of those that are visible at all, and of all), cases of one effect that claim anything,
-false alarms, unlisted effects flagged, and seconds of CPU. Every case keeps the criteria of its rounds, and the rank
-and gain of the true candidate next to the winner's. Cases that are done are not done again; `--workers` side by side.
-`--paired` takes of every kind five cases with one effect of at least `--noises` times its noise and three with none, by
-seeds from the number given; `--table` stores a row for each, `--claims` one for each round of all cases below `--out`,
-to which `POLICY.claim_offset` and `claim_weight` are fitted. The proof (`thermodrift prove --plants …`) asks the same
-under seal, with baselines.
+Draws cases of the proof for every kind (nothing missing, one effect or two, an effect of no list), diagnoses each, and
+prints by kind: effects named (of those that are visible at all, and of all), claims and how many of them are true, false
+alarms, cases of two effects with both named, unlisted effects flagged, and seconds of CPU. An effect is named where a
+finding, or an explanation that these recordings cannot distinguish from it, has its mechanism and its place. Cases that
+are done are not done again; `--workers` side by side. `--paired` takes of every kind eleven cases with one effect of at
+least `--noises` times its noise, seven with none and three with two, by seeds from the number given; `--table` stores a
+row for each, `--claims` one for each round, to which `POLICY.claim_weights` is fitted; what is visible is not judged for
+it. The proof (`thermodrift prove --plants …`) asks the same under seal, with baselines.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import argparse
 import json
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ from diagnosis.contracts import Candidate
 from diagnosis.diagnose import diagnose
 from diagnosis.fitting.batches import usable_batches
 from diagnosis.result import Diagnosis
-from diagnosis.search.claims import Round
+from diagnosis.search.claims import Round, alike
 from evidence.scoring.answer_key import AnswerKey, Spot
 from evidence.scoring.matching import names_term
 from thermodrift_exam.proof.scoring.true_model import TrueModel, true_model
@@ -47,19 +47,21 @@ from thermodrift_exam.proof.suite.other_kinds import drawn_kind, executed_kind, 
 from twin.compile import compile_network
 from twin.schema import TwinPart, twin_part
 
-PAIRED: dict[Kind, int] = {"one": 5, "nothing": 3}  # cases of each kind
+PAIRED: dict[Kind, int] = {"one": 11, "nothing": 7, "two": 3}  # cases of each kind
 SHARES: dict[Kind, float] = {"nothing": 0.4, "one": 0.45, "unlisted": 0.15}
 SHOWN = 10
 
 
 def examined(
-    kind: PlantKind, seed: int, out: str, proposed: int = 0, paired: Kind | None = None, noises: float = 3.0
-) -> dict[str, Any]:
+    kind: PlantKind, seed: int, out: str, proposed: int = 0, paired: Kind | None = None, noises: float = 3.0,
+    truth: bool = True,
+) -> dict[str, Any]:  # fmt: skip
     """One case, from its file where it is done already; with so many proposed runs after the first answer.
 
     Args:
         paired: what the case conceals; by default it is drawn.
         noises: least size of the effect of a paired case, by the noise of the channel that it moves most.
+        truth: whether it is judged if the effects are visible at all.
     """
     path = Path(out) / f"{kind}_{seed}{f'_{paired}' if paired else ''}.json"
     if path.exists():
@@ -84,7 +86,7 @@ def examined(
             row |= _answered(done, key, part)
             row["cpu_s"] = round(time.process_time() - begun, 1)
             row["proposed"] = list(_proposed(done, case.machine, batches, answer["redraw"], key, proposed))
-            if what == "one":
+            if what in ("one", "two") and truth:
                 row |= _visible(true_model(case.machine, batches, answer))
     except (InputError, WorkError) as error:
         row["trouble"] = str(error)
@@ -93,18 +95,21 @@ def examined(
 
 
 def _answered(done: Diagnosis, key: AnswerKey, part: TwinPart) -> dict[str, Any]:
-    """The claims of a diagnosis, whether the first is right, and the criteria of its rounds."""
+    """The claims of a diagnosis with the terms that each names, whether the first is right, and the rounds' figures."""
     found = done.findings
     bodies = {name: sensor.at.partition("@")[0] for name, sensor in part.sensors.items()}
-    first = found.findings[0] if found.findings else None
-    right = (
-        first is not None
-        and bool(key.terms)
-        and names_term(first.mechanism, Spot(first.where.kind, first.where.name), key.terms[0], bodies)
-    )
-    listed = [
-        {"name": f"{f.mechanism} {f.where.name}", "gain": f.evidence.get("gain_nats", 0.0)} for f in found.findings
-    ]
+    listed = []
+    for f in found.findings:
+        alike = [f, *(a for a in f.alternatives if a.alike)]
+        of = [
+            k for k, term in enumerate(key.terms)
+            if any(names_term(a.mechanism, Spot(a.where.kind, a.where.name), term, bodies) for a in alike)
+        ]  # fmt: skip
+        listed.append({
+            "name": f"{f.mechanism} {f.where.name}", "gain": f.evidence.get("gain_nats", 0.0), "of": of,
+            "alike": len(alike), "probability": f.probability,
+        })  # fmt: skip
+    right = bool(listed) and bool(listed[0]["of"])
     rounds = [_round(r, key, bodies) for r in done.search.rounds] if done.search is not None else []
     return {"right": right, "listed": listed, "verdict": found.verdict, "rounds": rounds}
 
@@ -133,23 +138,25 @@ def _proposed(
 
 def _visible(truth: TrueModel) -> dict[str, Any]:
     """Whether the true effects, refitted, are visible (`proof.scoring.true_model`)."""
-    return {"visible": list(truth.visible), "true_gain": truth.gain_nats, "true_structure": truth.threshold_nats}
+    return {"visible": list(truth.visible), "true_gain": truth.gain_nats}
 
 
 def _round(r: Round, key: AnswerKey, bodies: Mapping[str, str]) -> dict[str, Any]:
-    """The claim of a round with its features, its best refits, and the rank of the true candidate in the screen."""
+    """The likeliest claim of a round with its figures, its best refits, and the true candidate's rank in the screen."""
 
     def right(c: Candidate) -> bool:
         return any(names_term(c.mechanism, Spot(c.where.kind, c.where.name), term, bodies) for term in key.terms)
 
+    same = [t for t in r.tried if r.best is not None and (t is r.best or alike(r.best, t))]
     tried = [{"name": t.candidate.name, "gain": t.gain, "right": right(t.candidate)} for t in r.tried]
     screened = [
         {"name": s.candidate.name, "screen": k, "gain": s.gain, "absorbed": s.absorbed}
         for k, s in enumerate(r.screen.scored) if right(s.candidate)
     ]  # fmt: skip
     return {
-        "accepted": r.accepted, "trust": r.trust, "fall": r.fall, "raised": list(r.raised),
-        "right": r.best is not None and right(r.best.candidate), "threshold": r.threshold, "tried": tried,
+        "accepted": r.accepted, "trust": r.trust, "right": any(right(t.candidate) for t in same),
+        "figures": asdict(r.figures) if r.figures else None, "evidence": r.before.log_evidence,
+        "lead_rows": r.before.lead_rows, "hyper": asdict(r.before.hyper), "tried": tried,
         "screened": len(r.screen.scored), "true": screened[:SHOWN],
     }  # fmt: skip
 
@@ -178,64 +185,72 @@ def after_proposed(rows: Sequence[Mapping[str, Any]], runs: int) -> list[str]:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """One line a kind, and one for all."""
-    out = ["kind        n none/one/unl   named of visible   named of one   claims   false alarms   unlisted   CPU s"]
-    kinds = sorted({r["kind"] for r in rows})
-    for kind in [*kinds, "all"]:
+    out = [
+        "kind        n none/one/two/unl   named of visible   named of one   true of claims   false alarms   both of two"
+        "   unlisted   CPU s"
+    ]
+    for kind in [*sorted({r["kind"] for r in rows}), "all"]:
         own = [r for r in rows if kind in ("all", r["kind"]) and "verdict" in r]
         if not own:
             continue
-        none, one, unlisted = ([r for r in own if r["what"] == what] for what in SHARES)
+        none, one, two, unlisted = ([r for r in own if r["what"] == w] for w in ("nothing", "one", "two", "unlisted"))
         seen = [r for r in one if any(r.get("visible", ()))]
+        made = [f for r in (*none, *one, *two) for f in r["listed"]]
         cells = [
-            f"{sum(r['right'] for r in seen):>4} of {len(seen):<4}",
-            f"{sum(r['right'] for r in one):>4} of {len(one):<4}",
-            f"{sum(bool(r['listed']) for r in one):>4}",
+            f"{sum(_named(r) for r in seen):>4} of {len(seen):<4}", f"{sum(_named(r) for r in one):>4} of {len(one):<4}",
+            f"{sum(bool(f['of']) for f in made):>4} of {len(made):<4}",
             f"{sum(bool(r['listed']) for r in none):>4} of {len(none):<4}",
+            f"{sum(_named(r) == 2 for r in two):>4} of {len(two):<4}",
             f"{sum(bool(r['listed']) for r in unlisted):>4} of {len(unlisted):<4}",
             f"{np.median([r['cpu_s'] for r in own]):6.1f}",
-        ]
-        out.append(f"{kind:<11} {len(none):>3} {len(one):>3} {len(unlisted):>3}   " + "   ".join(cells))
+        ]  # fmt: skip
+        counts = " ".join(f"{len(c):>3}" for c in (none, one, two, unlisted))
+        out.append(f"{kind:<11} {counts}   " + "   ".join(cells))
     return out
 
 
+def _named(r: Mapping[str, Any]) -> int:
+    """How many of the concealed effects its findings name."""
+    return len({k for f in r["listed"] for k in f["of"]})
+
+
 def pairs(
-    kinds: Sequence[PlantKind], first: int, out: Path, noises: float
-) -> list[tuple[PlantKind, int, str, int, Kind, float]]:
+    kinds: Sequence[PlantKind], first: int, out: Path, noises: float, truth: bool
+) -> list[tuple[PlantKind, int, str, int, Kind, float, bool]]:
     """The cases of `--paired`, in turn over the kinds."""
     return [
-        (kind, first - 1000 + 100 * k, str(out), 0, what, noises)
+        (kind, first - 1000 + 100 * k, str(out), 0, what, noises, truth)
         for k in range(max(PAIRED.values())) for what, n in PAIRED.items() if k < n for kind in kinds
     ]  # fmt: skip
 
 
 def as_rows(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """What was concealed, whether it is visible, what was claimed, and whether that is right; a row a case."""
+    """What was concealed, whether it is visible, what was claimed, and how much of that is true; a row a case."""
     found = []
     for r in rows:
-        one = r["what"] == "one"
-        seen, right = any(r.get("visible", ())), bool(r.get("right"))
+        effects = r["what"] in ("one", "two")
         found.append({
             "kind": r["kind"], "seed": r["seed"],
             "concealed": "+".join(t["effect"] for t in r["terms"]) or "nothing",
             "sigmas": " ".join(f"{t.get('sigma', 0):.1f}" for t in r["terms"]),
-            "visible": ("yes" if seen else "no") if one else "",
+            "visible": sum(bool(v) for v in r.get("visible", ())) if effects else "",
             "claimed": "; ".join(f["name"] for f in r.get("listed", ())),
-            "right": ("yes" if right else "no") if one else "", "cpu_s": round(r.get("cpu_s", 0.0)),
+            "true": sum(bool(f["of"]) for f in r.get("listed", ())),
+            "named": _named(r) if effects and "verdict" in r else "", "cpu_s": round(r.get("cpu_s", 0.0)),
         })  # fmt: skip
     return pd.DataFrame(found).sort_values(["kind", "seed", "concealed"])
 
 
 def claims(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
-    """The claim of every round, accepted or not, with how much less it leaves, and whether it is right."""
+    """The likeliest claim of every round, accepted or not, with its figures, and whether it is right."""
     found = [
         {
             "kind": r["kind"], "seed": r["seed"],
             "concealed": "+".join(t["effect"] for t in r["terms"]) or "nothing", "round": k,
             "claim": a["tried"][0]["name"], "gain_nats": round(a["tried"][0]["gain"], 1),
-            "threshold_nats": round(a["threshold"], 1), "fall": round(a["fall"], 4),
-            "right": "yes" if a["right"] else "no",
+            **{name: round(value, 5) for name, value in a["figures"].items()}, "right": "yes" if a["right"] else "no",
         }
-        for r in rows for k, a in enumerate(r.get("rounds", ()), start=1) if a["tried"]
+        for r in rows for k, a in enumerate(r.get("rounds", ()), start=1) if a["figures"]
     ]  # fmt: skip
     return pd.DataFrame(found).sort_values(["kind", "seed", "concealed", "round"])
 
@@ -256,7 +271,7 @@ def main() -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     tasks: list[tuple[Any, ...]] = []
     if given.paired is not None:
-        tasks += pairs(given.kinds or KIND_PLANTS, given.paired, given.out, given.noises)
+        tasks += pairs(given.kinds or KIND_PLANTS, given.paired, given.out, given.noises, given.claims is None)
     else:
         seeds, kinds = range(given.first, given.first + given.cases), given.kinds or ["lathe", "board"]
         tasks += [(kind, seed, str(given.out), given.proposed) for seed in seeds for kind in kinds]

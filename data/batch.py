@@ -86,6 +86,8 @@ class Batch:
     findings: tuple[Finding, ...] = ()
     labels: Mapping[str, Any] = field(default_factory=dict)
     place: int | None = None  # in the order that the machine file states, for batches without a start
+    held: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    """By driver what holds from each row to the next (n,), where that is known to differ from what the row shows."""
 
     @property
     def n_rows(self) -> int:

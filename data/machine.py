@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -186,8 +187,18 @@ class Joined(Form):
         return self
 
 
+Drivers = Literal["held", "instant", "mean"]
+LEAD_ROWS: Mapping[Drivers, float] = {"held": 0.0, "instant": 0.5, "mean": 1.0}
+"""By how many rows a driver's change comes before the row that first shows it."""
+
+
 class Recording(Form):
-    """How a recording file becomes batches."""
+    """How a recording file becomes batches.
+
+    `drivers` says what a row shows of a driver: the value that holds from the row on (`held`), the value at that
+    instant, so that a change happened half a row earlier on average (`instant`), or the mean over the interval that
+    ends with the row (`mean`). Where it is not stated, a calibration or a diagnosis learns it from the recordings.
+    """
 
     files: list[str] = ["*.csv", "*.xlsx", "*.parquet", "*.txt"]  # patterns inside a directory
     step_s: Annotated[float, Field(gt=0)] = 60.0  # of the regular grid in the lake
@@ -197,6 +208,7 @@ class Recording(Form):
     split: Split | None = None  # one long recording into runs
     schedule: Schedule | None = None  # drivers from a table
     joined: dict[str, Joined] = {}  # further files or sheets of the same runs, by a name of your choice
+    drivers: Drivers | None = None  # what a row shows of a driver; default: learned
 
 
 class ChannelPart(Section):

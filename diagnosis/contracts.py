@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from data.arrays import Array
 from data.batch import Batch
 from data.machine import Machine
-from diagnosis.fitting.marginal import Grams, Marginal
+from diagnosis.fitting.marginal import Grams, Hyper, Level, Marginal
 from diagnosis.policy import POLICY
 from twin.calibration.fit_problem import Noise, estimate
 from twin.calibration.least_squares import State, x_of
@@ -202,6 +202,7 @@ class Point:
     problem: CalibrationProblem
     z: Array
     nuisance: list[Array]
+    lead_rows: float  # by how many rows a driver's change comes before the row that first shows it
 
     @cached_property
     def x(self) -> Array:
@@ -226,7 +227,7 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class Fitted(Point):
-    """A point at its best fit under a covariance.
+    """A point at its best fit under a covariance, at the hyperparameters `hyper` of that.
 
     `columns` (n_b, p + 1) of every batch are the whitened model, per unit of z, and the target; `runs` that the batches
     come from, where they are blocks of fewer. `nuisance` is where the batches' own unknowns were linearised, `own` what
@@ -234,31 +235,35 @@ class Fitted(Point):
     """
 
     marginal: Marginal
+    hyper: Hyper
     columns: list[Array]
     runs: int = 0
-    weight: tuple[float, ...] = ()  # by channel, where some count for more when the twin is to simulate alone
     base: Fitted | None = None  # that this one was begun from, by another twin part
 
     @cached_property
     def grams(self) -> Grams:
         return self.marginal.grams(self.columns)
 
+    @property
+    def level(self) -> Level:
+        return self.marginal.level(self.hyper)
+
     @cached_property
     def log_evidence(self) -> float:
         """Nats, up to a constant of the recordings (Laplace approximation)."""
-        return self.marginal.log_evidence(self.grams)
+        return self.level.log_evidence(self.grams)
 
     @cached_property
     def foretold(self) -> Array:
         """Log density (B,) of every batch, predicted from all others, in nats."""
-        return self.marginal.foretold(self.grams)
+        return self.level.foretold(self.grams)
 
     @cached_property
     def own(self) -> list[Array]:
         """Each batch's unknowns by least squares under the covariance's blocks: a start is no structure."""
         white, blocks = self.marginal.covariance.white, self.problem.linearise(self.x, self.nuisance)
-        every = enumerate(zip(blocks, self.nuisance, strict=True))
-        return [v + own_step(white(k, b.nuisance), v, white(k, b.residual)) for k, (b, v) in every]
+        every = enumerate(zip(blocks, self.nuisance, self.level.own_size, strict=True))
+        return [v + own_step(white(k, b.nuisance), v, white(k, b.residual), size) for k, (b, v, size) in every]
 
     @cached_property
     def noise(self) -> Noise:
@@ -270,15 +275,17 @@ class Fitted(Point):
     def state(self) -> State:
         """The fit as a calibration has it; its information is that with structure integrated out."""
         state = State.at(self.problem, self.z, self.own, self.noise)
-        c = self.marginal.reduced(self.grams)[:-1, :-1]
-        root = np.asarray(np.linalg.cholesky(c + np.eye(len(c))).T, float)
+        c = self.level.reduced(self.grams)[:-1, :-1]
+        root = np.asarray(np.linalg.cholesky(c + self.level.prior * np.eye(len(c))).T, float)
         return replace(state, arrow=replace(state.arrow, root=root, target=np.zeros(len(c))))
 
 
-def own_step(jacobian: Array, own: Array, left: Array) -> Array:
-    """The step (q,) of a batch's own unknowns from `own` that leaves least of rows `left` (n,), priors counted."""
-    normal = jacobian.T @ jacobian + np.eye(jacobian.shape[1])
-    return np.asarray(np.linalg.solve(normal, jacobian.T @ left - own), float)
+def own_step(jacobian: Array, own: Array, left: Array, size: Array | float = 1.0) -> Array:
+    """The step (q,) of a batch's own unknowns from `own` that leaves least of rows `left` (n,), priors of sd `size`
+    counted."""
+    precision = np.broadcast_to(1.0 / np.asarray(size) ** 2, own.shape)
+    normal = jacobian.T @ jacobian + np.diag(precision)
+    return np.asarray(np.linalg.solve(normal, jacobian.T @ left - precision * own), float)
 
 
 @dataclass(frozen=True)
@@ -321,9 +328,8 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "candidates": ("rank", "mechanism", "kind", "name", "words", "cluster", "gain", "improved", "batches", "absorbed",
                    "amplitude", "unit", "probability"),
     "map": ("kind", "place", "by", "label", "value", "unit", "z"),  # by: batch, regime, hour or since_start
-    "steps": ("step", "words", "gain", "threshold", "removed", "improved", "accepted"),
+    "steps": ("step", "words", "gain", "threshold", "probability", "improved", "accepted"),
     "refinements": ("what", "why", "before", "after"),
     "limits": ("mechanism", "kind", "name", "words", "limit", "unit", "absorbed", "absorbed_by"),
     "flux": ("kind", "place", "batch", "time_s", "value", "sd", "unit"),
-    "null": ("replicate", "gain"),
 }  # fmt: skip

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from data.batch import Batch
 from data.errors import InputError, WorkError
-from data.machine import Machine
+from data.machine import LEAD_ROWS, Machine
 from data.processes import Processes
 from diagnosis.candidates.free_forms import Form
 from diagnosis.contracts import Fitted, Where
@@ -41,7 +41,6 @@ from diagnosis.findings.schema import (
 from diagnosis.findings.statement import finding_of, verdict_statement
 from diagnosis.fitting.batches import enough_batches, usable_batches
 from diagnosis.fitting.fitted import (
-    LeftOutRows,
     baseline,
     check,
     left_out_rows,
@@ -116,12 +115,6 @@ def diagnose(
     return replace(diagnosis, findings=diagnosis.findings.model_copy(update={"seconds": seconds}))
 
 
-def stages(done: Search) -> list[tuple[Fitted, LeftOutRows]]:
-    """Every fit of the search, from the baseline to the last, and what it leaves of the batches left out."""
-    fits = [r.before for r in done.accepted] + [done.final]
-    return [(f, left_out_rows(f)) for f in fits]
-
-
 def _located(fitted: Fitted, batches: Sequence[Batch], tell: Progress | None = None) -> Located | str:
     """The map of what a fit cannot explain, or why there is none."""
     try:
@@ -147,9 +140,8 @@ def _diagnosis(
 ) -> Diagnosis:
     """What was found, from the search for listed effects, the effect of no list, and the tables of its localisation;
     `names` of the recordings, `batches` what was fitted of them, with all rows."""
-    machine, steps = done.baseline.machine, stages(done)
-    final, named = done.final, done.accepted
-    before, after = steps[0][1], steps[-1][1]
+    machine, final, named = done.baseline.machine, done.final, done.accepted
+    before, after = left_out_rows(done.baseline), left_out_rows(final)
     full = on_all_rows(final, batches)
     written = _intervals(plain(full))  # the file's twin simulates alone
     intervals = {i.name: i for i in written}
@@ -158,10 +150,7 @@ def _diagnosis(
     part_after = with_deviations(final)
     drafted, units = machine.twin is None, {r.channel: r.unit for r in rms}
     remarks += tuple(i.words for i in impossible(done.baseline))
-    refused = next((r for r in reversed(done.rounds) if r.raised and not r.accepted), None)
-    if refused is not None and refused.best is not None:
-        label = refused.best.candidate.label
-        remarks += (f"{label} is not accepted: it gains score, but raises {made.rises(refused.raised, units)}",)
+    remarks += _lead_remarks(machine, final)
     worse = {} if drafted else worsened(rows_as_given(on_all_rows(done.baseline, batches)), left_out_rows(full))
     if worse:
         remarks += (f"the machine file keeps its values and parts: the fitted ones raise {made.rises(worse, units)}",)
@@ -169,7 +158,7 @@ def _diagnosis(
     separates = run.label if run is not None else ""
     found = []
     for r in named:
-        own_rms = rms_of(made.rms_table(*_around(done, r, steps), final), final)
+        own_rms = rms_of(made.rms_table(left_out_rows(r.before), after, final), final)
         one = found_of(done, r, part_after, intervals, own_rms, separates)
         if one.kind.is_unlisted and r.best is not None:
             one = unlisted_found(one, r.forms[r.best.candidate.name], final, r.best.candidate, intervals)
@@ -202,7 +191,6 @@ def _diagnosis(
         "candidates": made.candidates_table(done.rounds),
         "steps": made.steps_table(done.rounds),
         "limits": table,
-        "null": made.null_table(last.null),
         **located,
     }
     simulated = any(b.simulated for b in final.batches)
@@ -241,15 +229,21 @@ def _diagnosis(
     )
 
 
+def _lead_remarks(machine: Machine, fitted: Fitted) -> tuple[str, ...]:
+    """When drivers act, where that was learned and is not from their row on."""
+    if machine.recording.drivers is not None or not fitted.lead_rows:
+        return ()
+    meant = next(name for name, rows in LEAD_ROWS.items() if rows == fitted.lead_rows)
+    row = "half a row" if fitted.lead_rows < 1.0 else "a row"
+    return (
+        f"a change of a driver comes {row} before the row that first shows it (learned from the recordings; "
+        f"recording.drivers: {meant} in the machine file states it)",
+    )
+
+
 def _intervals(fitted: Fitted) -> tuple[Interval, ...]:
     fit = result(fitted.problem, fitted.state, POLICY.fit_tolerance_nats, "")
     return tuple(intervals90(fit, fitted.problem.unknowns))
-
-
-def _around(done: Search, r: Round, steps: Sequence[tuple[Fitted, LeftOutRows]]) -> tuple[LeftOutRows, LeftOutRows]:
-    """What is left of the batches left out before and after one accepted round."""
-    k = next(k for k, other in enumerate(done.accepted) if other is r)
-    return steps[k][1], steps[k + 1][1]
 
 
 def _per_batch(table: pd.DataFrame, column: str) -> pd.Series:

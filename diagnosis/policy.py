@@ -37,6 +37,7 @@ class Policy:
     initial_rows_per_value: float = convention(20.0, "rows", "so many rows of a smooth misfit count as one")
     first_steps: int = cost(40, "steps", "bounds the descent from the values of the machine file")
     baseline_steps: int = cost(12, "steps", "under each covariance")
+    own_rounds: int = cost(2, "rounds", "of the fit's values and the runs' own unknowns in turn")
     weight_rounds: int = cost(3, "rounds", "of more weight for channels that would be predicted worse")
     weight_factor: float = convention(4.0, "factor", "of such a channel's weight in each of them")
     plain_steps: int = cost(20, "steps", "of a fit that is to simulate alone; most end after ten")
@@ -73,6 +74,11 @@ class Policy:
     structure_scales: tuple[float, ...] = analytic(
         (0.0, 0.06, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0), "of the draws", "grid of the likelihood"
     )
+    imperfection_scales: tuple[float, ...] = analytic((0.0, 0.25, 0.5, 1.0), "of their sd", "grid of the likelihood")
+    value_scales: tuple[float, ...] = analytic((1.0, 2.0, 4.0), "of the file's spreads", "grid of the likelihood")
+    start_scales: tuple[float, ...] = analytic((0.1, 0.3, 1.0), "of the file's initial spread", "grid of the likelihood")
+    first_hyper: tuple[float, ...] = convention((0.5, 0.25, 1.0, 1.0), "of each", "where the climb to the likeliest sizes begins")
+    hyper_rounds: int = cost(2, "rounds", "of sizes and values in turn")
     noise_min_rows: int = analytic(10, "rows", "fewer second differences show no noise")
     noise_kept_share: float = analytic(0.95, "of the rows", "the rest are jumps of a driver")
     noise_kept_factor: float = analytic(1.15, "factor", "what that share lacks of a normal distribution's rms")
@@ -101,10 +107,7 @@ class Policy:
     rising_film_share: float = physical(
         0.35, "of an exposure", "about all of a film is natural convection and radiation"
     )
-    rising_link_share: float = physical(0.1, "of a link", "joints close as they warm")
     rising_W_per_m2K: float = analytic(2.7, "W/m2K", "natural convection at 6 K: McAdams 1954, 0.5 m high")
-    time_skew_sd_rows: float = analytic(0.1, "rows", "a row is a mean over its interval, which blurs corners")
-    logger_skew_sd_rows: float = analytic(0.3, "rows", "a time stamp lies anywhere within its interval, uniformly")
 
     # Priors of candidates
     doubted_value_log_sd: float = physical(1.0, "log", "prior of a value of the machine file that is doubted")
@@ -127,14 +130,15 @@ class Policy:
 
     # Screening and refits
     screen_amplitude_noises: float = physical(10.0, "given noises", "sd of a signature in the channel it changes most")
+    screened_scales: int = cost(3, "scales of structure", "the likeliest without an effect and smaller ones")
     refit_min_screen_gain_nats: float = convention(2.0, "nats", "a smaller gain in the screen is not refitted")
     unlisted_term_cost_nats: float = analytic(1.0, "nats", "of what gains alike a listed law comes first")
-    run_windows: int = cost(24, "parts of a run", "in which what happens once is looked for")
+    run_windows: int = cost(12, "parts of a run", "in which what happens once is looked for")
+    form_places: int = cost(4, "places", "at which products and squares of drivers are looked for")
     free_form_credit: float = development(0.9, "of its gain", "free forms imitate any law to within a tenth")
     refits: int = cost(10, "refits", "of a round; each takes half a second")
     refits_of_mechanism: int = cost(3, "refits", "of one mechanism at several places")
     same_signature_cosine: float = analytic(0.95, "|cos|", "beyond it recordings cannot distinguish two candidates")
-    null_folds: int = cost(5, "folds", "of refined twins that are left out of the covariance in turn")
     label_swaps: int = cost(1, "pairs", "exchanged labels are rare; the plainest is tried")
     label_swap_min_gain_nats: float = development(
         60.0, "nats", "33 true swaps gained 70 or more, 37 of 40 false ones under 31"
@@ -146,18 +150,16 @@ class Policy:
     impossible_min_rows: int = convention(3, "rows", "a single one may be a fault of the recording")
     unseen_start_sd: float = analytic(2.0, "sd", "by which a body without a sensor may start off")
     settled: int = cost(4, "refits", "the likeliest, compared under the covariance that is likeliest for each")
-    claims_judged: int = cost(3, "refits", "the likeliest, of which the first that may be claimed is")
-    claim_offset: float = development(
-        -1.7, "log odds", "a logistic fit of 89 claims on six kinds, 27 of them right: results/claims.csv"
+    claim_weights: tuple[float, ...] = development(
+        (5.35, 2.0, 0.1, 1.0, 1.5),
+        "log odds",
+        "offset, and for the log of the relative gain, log odds, lead, agreeing runs: results/claims.csv",
     )
-    claim_weight: float = development(
-        12.3, "log odds", "of the same fit, for each unit of `diagnosis.search.claims.fall`; 90 % interval 6 to 28"
-    )
+    grown_min_probability: float = cost(0.25, "probability", "of an effect with which the next is looked for")
     claim_min_probability: float = convention(
         0.6, "probability", "a false claim costs half as much again as a missed one"
     )
-    chance_quantile: float = convention(0.99, "probability", "what chance exceeds once in a hundred cases is no claim")
-    temperature_null_share: float = development(0.25, "of the null threshold", "scale on which gains are compared")
+    temperature_share: float = convention(0.05, "of the gain", "by as much structure scatters what explanations gain")
     temperature_min_nats: float = development(3.0, "nats", "wrong explanations lead by as much")
     max_effects: int = cost(4, "effects", "of one search")
 

@@ -1,9 +1,8 @@
 """Discretisation errors of a lumped network, which every fit may take up as slack.
 
 A sensor in a casting sits in a gradient that a lump does not have: it lags, or leads where it is near the heat. A
-length of an error chain spans a part of its body, and bodies outside the chain tilt it a little. A film that is stated
-as a constant follows its temperature difference. No heat is exactly the same in every run. Without slack these errors
-would pass for physics.
+length of an error chain spans a part of its body, and bodies outside the chain tilt it a little. Without slack these
+errors would pass for physics. Their common size is a hyperparameter of every fit (`marginal.Hyper.imperfections`).
 """
 
 from __future__ import annotations
@@ -14,14 +13,12 @@ import numpy as np
 
 from diagnosis.contracts import Candidate, CandidateKind, Point, Where
 from diagnosis.policy import POLICY
-from twin.compiling.cells import several
 from twin.mechanisms import MECHANISMS
 from twin.schema import MechanismPart
 
 SLACK_MECHANISMS = (
     "sensor_place",
     "sensor_lag",
-    "time_skew",
     "column_bending",
     "spindle_growth",
     "sensor_bonding",
@@ -38,8 +35,6 @@ def slack(proposed: Sequence[Candidate], fitted: Point) -> dict[str, float]:
             continue
         if c.mechanism == "sensor_place":
             out[c.name] = POLICY.sensor_place_sd
-        elif c.mechanism == "time_skew":
-            out[c.name] = _skew_sd_s(c, fitted)
         elif c.mechanism == "sensor_bonding":
             out[c.name] = POLICY.sensor_bonding_sd
         elif c.mechanism == "sensor_offset":
@@ -77,31 +72,21 @@ def never_reported(proposed: Sequence[Candidate], fitted: Point) -> set[str]:
     }
 
 
-def _skew_sd_s(c: Candidate, fitted: Point) -> float:
-    """Prior sd of a clock's skew: of a sensor, of one error, and of all errors together, which share a logger."""
-    if c.where.kind == "sensor":
-        return POLICY.sensor_lag_sd_s
-    together = c.part is not None and len(several(c.part.acts_on)) > 1
-    return (POLICY.logger_skew_sd_rows if together else POLICY.time_skew_sd_rows) * fitted.step_s
-
-
 def _sides(c: Candidate) -> set[str]:
     assert c.part is not None and isinstance(c.part.at, dict)
     return set(c.part.at.values())
 
 
-def paths_that_rise(fitted: Point) -> list[tuple[Candidate, float]]:
-    """Heat of every exposure and link that grows faster than its temperature difference, with the sd of its size:
-    films rise by natural convection and radiation, joints close as they warm (McAdams 1954; Yovanovich 2005)."""
-    part, out = fitted.part, []
+def films_that_rise(fitted: Point) -> list[tuple[Candidate, float]]:
+    """Heat of every exposure that grows faster than its temperature difference, with the sd of its size: films rise by
+    natural convection and radiation (McAdams 1954)."""
     conductance = {e.name: float(e.conductance(fitted.values)) for e in fitted.problem.network.edges}
-    paths = [(k, e.of, e.to, POLICY.rising_film_share) for k, e in part.exposures.items()]
-    paths += [(k, *link.between, POLICY.rising_link_share) for k, link in part.links.items()]
-    for key, body, other, share in paths:
-        law = MechanismPart(law="natural_convection", at={"body": body, "air": other}, into=body)
+    out = []
+    for key, film in fitted.part.exposures.items():
+        law = MechanismPart(law="natural_convection", at={"body": film.of, "air": film.to}, into=film.of)
         name = f"rising_{key}".replace("-", "_")
-        rising = Candidate(law.law, Where("node", body), name, "", law, dict(MECHANISMS[law.law].off or {}))
-        out.append((rising, share * conductance[key] / POLICY.rising_W_per_m2K))
+        rising = Candidate(law.law, Where("node", film.of), name, "", law, dict(MECHANISMS[law.law].off or {}))
+        out.append((rising, POLICY.rising_film_share * conductance[key] / POLICY.rising_W_per_m2K))
     return out
 
 

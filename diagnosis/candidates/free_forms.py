@@ -58,6 +58,11 @@ class Form:
         return self.where.kind == "node"
 
     @property
+    def plain(self) -> bool:
+        """Whether it follows one thing, in proportion: a product or a square hardly shows where neither factor does."""
+        return self.role in ("constant", "linear", "per_K")
+
+    @property
     def label(self) -> str:
         """The term as an expression: ``spindle_rpm (T_head - 20)``."""
         names = [d.name for d in (self.level, self.other) if d is not None]

@@ -169,7 +169,8 @@ def found_of(
         evidence={
             "gain_nats": best.gain,
             "threshold_nats": float(done.threshold),
-            "removed_share": done.removed,
+            "relative_gain": done.figures.relative_gain if done.figures else 0.0,
+            "lead_share": done.figures.lead if done.figures else 0.0,
             "left_out_nats": float(best.by_run.sum()),
             "batches_improved": best.improved,
             "batches": len(final.batches),
@@ -200,14 +201,15 @@ def claimed(done: Round, part: TwinPart, final: Fitted) -> Found:
     every, _, _ = explanations(done)
     best = next(e for e in every if e.tried is done.best)
     c = best.tried.candidate
-    same = [e for e in every if (e.tried.candidate.mechanism, e.tried.candidate.where) == (c.mechanism, c.where)]
+    own = [e for e in every if e is best or e.alike]
+    same = [e for e in own if (e.tried.candidate.mechanism, e.tried.candidate.where) == (c.mechanism, c.where)]
     rest = [e for e in every if e not in same]
     return Found(
         mechanism=c.mechanism,
         where=c.where,
         place=_place_of(c, part),
         parameters={},
-        probability=min(sum(e.probability for e in same), probability_cap(final.runs)),
+        probability=min(sum(e.probability for e in own), probability_cap(final.runs)),
         context=context_label(c.part, c.where, part) if c.part is not None else "",
         others=tuple(_other(e, part) for e in reported([best, *rest])),
     )

@@ -335,13 +335,8 @@ def _amplitude(amplitudes: Mapping[str, float], mechanism: str) -> tuple[float, 
 
 def steps_table(rounds: Sequence[Round]) -> pd.DataFrame:
     rows = [
-        (k + 1, r.best.candidate.label, r.best.gain, r.threshold, r.removed, r.best.improved, r.accepted)
+        (k + 1, r.best.candidate.label, r.best.gain, r.threshold, r.trust, r.best.improved, r.accepted)
         for k, r in enumerate(rounds)
         if r.best is not None
     ]
     return pd.DataFrame(rows, columns=list(COLUMNS["steps"]))
-
-
-def null_table(null: Array) -> pd.DataFrame:
-    """The largest gain of any candidate in the recordings of each refined twin (T,), nothing missing."""
-    return pd.DataFrame({"replicate": np.arange(len(null)), "gain": null})

@@ -25,8 +25,9 @@ Share = Annotated[float, Field(ge=0, le=1)]
 # The keys of a finding's evidence; others may be added.
 EVIDENCE: Mapping[str, str] = {
     "gain_nats": "rise of the log score of the batches left out, in nats",
-    "threshold_nats": "gain that structure alone reaches when nothing is missing (99 % quantile)",
-    "removed_share": "share of the rms misfit that goes with the effect, geometric mean over channels, 0 to 1",
+    "threshold_nats": "gain from which on an effect that nothing else resembles is claimed",
+    "relative_gain": "gain over the absolute log evidence of the fit before, which the probability follows",
+    "lead_share": "share of the gain that the best explanation of another mechanism and place lacks",
     "batches_improved": "left-out batches whose error falls",
     "batches": "left-out batches",
     "sign_test_p": "chance of so many improved batches if improving were a coin's toss",
@@ -66,11 +67,13 @@ class FoundParameter(_Part):
 
 
 class Alternative(_Part):
-    """What would explain the same difference, and how probable that is."""
+    """What would explain the same difference, and how probable that is; `alike`: these recordings cannot distinguish it
+    from the finding, whose probability counts it."""
 
     mechanism: str
     where: Place
     probability: Share
+    alike: bool = False
 
 
 class Finding(_Part):

@@ -80,7 +80,8 @@ def finding_of(found: Found) -> Finding:
         },
         probability=found.probability,
         alternatives=tuple(
-            Alternative(mechanism=o.mechanism, where=_place(o.where), probability=o.probability) for o in found.others
+            Alternative(mechanism=o.mechanism, where=_place(o.where), probability=o.probability, alike=o.alike)
+            for o in found.others
         ),
         equation=equation_with_numbers(MECHANISMS[found.mechanism], values) if found.mechanism in MECHANISMS else "",
         statement=statement(found),

@@ -14,7 +14,7 @@ from data.errors import InputError
 from diagnosis.policy import POLICY
 from twin.calibration.problem import EVERY_S
 from twin.network import Network
-from twin.simulation.inputs import inputs_of
+from twin.simulation.inputs import acting, inputs_of
 
 
 def enough_batches(batches: Sequence[Batch]) -> tuple[list[Batch], tuple[str, ...]]:
@@ -42,22 +42,23 @@ def spacing_s(batches: Sequence[Batch]) -> float:
     return min(EVERY_S, lengths[len(lengths) // 2] / POLICY.min_rows_per_batch) or EVERY_S
 
 
-def coarse(batches: Sequence[Batch], every_s: float) -> list[Batch]:
+def coarse(batches: Sequence[Batch], every_s: float, lead_rows: float = 0.0) -> list[Batch]:
     """The batches with a row every `every_s`, or their own step where that is longer: what a machine does takes
-    minutes, however often it is recorded. Sensors and errors are as read there, drivers their mean until the next row,
-    so that heat is kept."""
-    return [_thinned(b, round(every_s / b.step_s)) if b.step_s else b for b in batches]
+    minutes, however often it is recorded. What holds between two rows is the mean of what held there, so that heat is
+    kept; drivers act `lead_rows` before the row that first shows a change (`twin.simulation.inputs.acting`)."""
+    own = acting(batches, lead_rows)
+    return [_thinned(b, round(every_s / b.step_s)) if b.step_s else b for b in own]
 
 
 def _thinned(batch: Batch, stride: int) -> Batch:
     if stride < 2:
         return batch
-    table = batch.table.iloc[::stride].reset_index(drop=True)
-    for name in batch.names("driver"):
-        if name in batch.table.columns:
-            masked = pd.Series(batch.masked(name))
-            table[name] = masked.groupby(np.arange(batch.n_rows) // stride).mean().to_numpy()
-    return replace(batch, table=table)
+    group = np.arange(batch.n_rows) // stride
+    held = {
+        n: pd.Series(batch.held.get(n, batch.masked(n))).groupby(group).mean().to_numpy()
+        for n in batch.names("driver") if n in batch.table.columns
+    }  # fmt: skip
+    return replace(batch, table=batch.table.iloc[::stride].reset_index(drop=True), held=held)
 
 
 def usable_batches(network: Network, batches: Sequence[Batch]) -> tuple[list[Batch], tuple[str, ...]]:

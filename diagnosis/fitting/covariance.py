@@ -64,6 +64,7 @@ class Covariance:
     channels: tuple[NDArray[np.int64], ...]
     roots: tuple[dict[int, Array], ...]
     directions: tuple[Array, ...]
+    drawn: int = 0  # how many of the directions, the first ones, were drawn; the others are imperfections
     structure: Structure | None = None
     share: float = 0.0  # of what draws alone show
     factor: Array | None = None  # of each channel's (C,) block sd
@@ -82,6 +83,11 @@ class Covariance:
         for channel, at in self._slices[batch]:
             out[at] = self.roots[batch][channel] @ rows[at]
         return out
+
+    @property
+    def count(self) -> int:
+        """How many directions there are."""
+        return self.directions[0].shape[1] if self.directions else 0
 
     @cached_property
     def _slices(self) -> list[Slices]:
@@ -116,7 +122,7 @@ def rough(problem: CalibrationProblem, directions: Sequence[Array]) -> Covarianc
         rows = np.arange(at.stop - at.start)
         return np.asarray(np.eye(len(rows)) + share * keep ** np.abs(np.subtract.outer(rows, rows)), float)
 
-    return Covariance.of(problem, block, directions=tuple(directions))
+    return Covariance.of(problem, block, directions=tuple(directions), drawn=directions[0].shape[1])
 
 
 def learned(problem: CalibrationProblem, structure: Structure, share: float) -> Covariance:
@@ -127,7 +133,9 @@ def learned(problem: CalibrationProblem, structure: Structure, share: float) -> 
         white = structure.noise[c] ** 2 * np.eye(len(alone))
         return np.asarray(white + share / alone.shape[1] * alone @ alone.T, float)
 
-    return Covariance.of(problem, block, directions=structure.directions, structure=structure, share=share)
+    drawn = structure.drawn[0].shape[1]
+    directions = structure.directions
+    return Covariance.of(problem, block, directions=directions, drawn=drawn, structure=structure, share=share)
 
 
 def white_noise(problem: CalibrationProblem) -> Array:

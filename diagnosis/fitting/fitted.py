@@ -28,17 +28,16 @@ from diagnosis.fitting.covariance import (
     rough,
     white_noise,
 )
-from diagnosis.fitting.marginal import Marginal
+from diagnosis.fitting.marginal import Hyper, Marginal
 from diagnosis.fitting.twins import drawn_misfits
 from diagnosis.policy import POLICY
-from diagnosis.screening.signatures import imperfections
+from diagnosis.screening.signatures import imperfections, rising_films
 from twin.calibration.estimate import check_batches
 from twin.calibration.fit_problem import Block, Noise, Unknown
 from twin.calibration.least_squares import (
     FitOptions,
     State,
     annealed,
-    descend,
     likelier,
     misfits,
     noise_left,
@@ -47,8 +46,10 @@ from twin.calibration.least_squares import (
     z_bounds,
 )
 from twin.calibration.problem import CalibrationProblem
+from twin.calibration.recorder import settled_with_lead
 from twin.compile import compile_network
 from twin.schema import TwinPart
+from twin.simulation.inputs import acting
 
 
 def check(machine: Machine, batches: Sequence[Batch]) -> None:
@@ -68,8 +69,9 @@ def baseline(
 ) -> Fitted:
     """The twin part fitted to all batches, under the covariance of what refined twins about that fit show.
 
-    All fits are to `coarse` rows, so that their cost does not depend on how often a machine is recorded. Refined twins
-    are drawn twice: about a first calibration, and about the fit under what those say.
+    All fits are to `coarse` rows, so that their cost does not depend on how often a machine is recorded. First it is
+    learned when drivers changed within a row. Refined twins are drawn twice: about a first calibration, and about the
+    fit under what those say.
 
     Args:
         runs: the number of runs, where batches are blocks of fewer.
@@ -81,21 +83,22 @@ def baseline(
     """
     check(machine, batches)
     tell, runs = progress or (lambda step, n, of: None), runs or len(batches)
-    every_s = spacing_s(batches)
-    batches = coarse(batches, every_s)
-    problem = CalibrationProblem.of(compile_network(machine, part=part), batches, every_s)
+    network, every_s = compile_network(machine, part=part), spacing_s(batches)
     tell("baseline", 1, 3)
-    k = len(problem.channels)
+    k = len(network.readings) + len(network.errors)
     alike = Noise(np.full(k, POLICY.initial_noise_factor), np.full(k, POLICY.initial_rows_per_value))
     options = FitOptions(max_iterations=POLICY.first_steps, tolerance=POLICY.fit_tolerance_nats)
-    state, _ = settled(problem, options, None, alike)
-    at = Point(machine, part, tuple(batches), problem, state.z, state.nuisance)
+    lead_rows, problem, state, _ = settled_with_lead(
+        machine, lambda lead: CalibrationProblem.of(network, coarse(batches, every_s, lead), every_s), options, alike
+    )
+    batches = coarse(batches, every_s, lead_rows)
+    at = Point(machine, part, tuple(batches), problem, state.z, state.nuisance, lead_rows)
     rng = np.random.default_rng(seed)
     first = POLICY.refined_twins // 2
     drawn = _structure(at, first, rng, tell)
     covariance = rough(problem, [POLICY.rough_structure_factor / np.sqrt(first) * d for d in drawn])
     tell("baseline", 2, 3)
-    at = _fitted(at, covariance, runs)
+    at = _fitted(at, covariance, Hyper(), runs)
     tell("baseline", 3, 3)
     return structured(at, runs, seed, tell)
 
@@ -111,43 +114,41 @@ def structured(at: Point, runs: int, seed: int = 0, tell: Callable[[str, int, in
     blocks = list(problem.linearise(at.x, at.nuisance))
     known = beyond_recalibration(blocks, _spread(problem.unknowns), imperfections(at))
     structure = Structure(drawn, known, white_noise(problem))
-    return _learned(at, structure, runs, POLICY.alone_shares, np.ones(len(problem.channels)))
+    return _learned(at, structure, runs, POLICY.alone_shares, Hyper(*POLICY.first_hyper))
 
 
 def on_all_rows(fitted: Fitted, batches: Sequence[Batch]) -> Fitted:
     """The fit, simulated alone, to the recordings as they are; itself where they have no rows between."""
     if [b.n_rows for b in batches] == [b.n_rows for b in fitted.batches]:
         return fitted
-    one = plain(fitted)
+    one, batches = plain(fitted), acting(batches, fitted.lead_rows)
     problem = CalibrationProblem.of(one.problem.network, batches, spacing_s(batches))
-    at = Point(one.machine, one.part, tuple(batches), problem, one.z, one.nuisance)
-    return replace(calibrated(at, one.noise, one.runs), weight=fitted.weight, base=fitted)
+    at = Point(one.machine, one.part, tuple(batches), problem, one.z, one.nuisance, one.lead_rows)
+    return replace(calibrated(at, one.noise, one.runs), base=fitted)
 
 
 def relearned(fitted: Fitted) -> Fitted:
-    """The fit at its optimum with the scale of structure, and what no draw shows, that are likeliest now: they may have
-    stood in for an effect. The likelier of two optima: that near the fit, and that near the `plain` one."""
+    """The fit at its optimum, all derivatives taken anew, under the hyperparameters and the noise of every channel that
+    are likeliest now: those of the fit before may have stood in for an effect."""
     before = fitted.marginal.covariance
-    if (structure := before.structure) is None:
+    if before.structure is None:
         return relinearised(fitted)
-    factor = np.ones(len(fitted.rows)) if before.factor is None else before.factor
-    starts = fitted, under(plain(fitted), before)
-    done = [_learned(start, structure, fitted.runs, (before.share,), factor) for start in starts]
-    return replace(max(done, key=lambda f: f.log_evidence), weight=fitted.weight, base=fitted.base)
+    done = _learned(fitted, before.structure, fitted.runs, (before.share,), fitted.hyper)
+    return replace(done, base=fitted.base) if done.log_evidence > fitted.log_evidence else fitted
 
 
-def _learned(at: Point, structure: Structure, runs: int, shares: Sequence[float], factor: Array) -> Fitted:
-    """The fit under the likeliest covariance; `factor` (C,) on each channel's sd begins what no draw shows, as where a
-    nut passes a sensor."""
-    covariance = _likeliest(at, structure, shares, factor)
-    fitted = _fitted(at, covariance, runs)
+def _learned(at: Point, structure: Structure, runs: int, shares: Sequence[float], begin: Hyper) -> Fitted:
+    """The fit under the likeliest covariance. A channel in which no draw shows what it leaves, as where a nut passes a
+    sensor, has more noise."""
+    covariance, hyper = _likeliest(at, structure, shares, begin)
+    fitted, factor = _fitted(at, covariance, hyper, runs), np.ones(len(at.problem.channels))
     for _ in range(POLICY.channel_rounds):
         new = np.maximum(factor * _excess(fitted), 1.0)
         change = new / factor
         if np.abs(np.log(change)).max() < np.log(POLICY.channel_min_excess):
             break
         covariance, factor = covariance.scaled(change), new
-        fitted = _fitted(fitted, covariance, runs)
+        fitted = tuned(_fitted(fitted, covariance, fitted.hyper, runs))
     return fitted
 
 
@@ -163,6 +164,9 @@ def _structure(at: Point, draws: int, rng: np.random.Generator, tell: Callable[[
 
     def about(at: Point) -> list[Array]:
         drawn = drawn_misfits(at.machine, at.part, at.batches, at.problem, at.values, draws, rng, progress)
+        films = rising_films(at)  # linear about the fit: a film in every twin takes no simulation of its own
+        sizes = np.abs(rng.standard_normal((films[0].shape[1], draws)))
+        drawn = [d + f @ sizes for d, f in zip(drawn, films, strict=True)]
         blocks = list(at.problem.linearise(at.x, at.nuisance))
         return clipped(beyond_recalibration(blocks, _spread(at.problem.unknowns), drawn))
 
@@ -172,29 +176,29 @@ def _structure(at: Point, draws: int, rng: np.random.Generator, tell: Callable[[
         return about(replace(at, z=np.clip(at.z, -POLICY.drawn_max_sd, POLICY.drawn_max_sd)))
 
 
-def _likeliest(at: Point, structure: Structure, shares: Sequence[float], factor: Array) -> Covariance:
-    """The covariance of the largest marginal likelihood, over the scale of structure and the share of what each draw
-    alone shows; imperfections of sensors, clocks and films are of given sd."""
-    blocks, n = list(at.problem.linearise(at.x, at.nuisance)), structure.drawn[0].shape[1]
+def _likeliest(at: Point, structure: Structure, shares: Sequence[float], begin: Hyper) -> tuple[Covariance, Hyper]:
+    """The covariance and hyperparameters of the largest marginal likelihood, over the share of what each draw alone
+    shows and the sizes of all that is integrated out."""
+    blocks = list(at.problem.linearise(at.x, at.nuisance))
     best, most = None, -np.inf
     for share in shares:
-        covariance = learned(at.problem, structure, share).scaled(factor)
-        marginal = Marginal(covariance, [b.nuisance for b in blocks], at.nuisance)
-        grams = marginal.grams(_columns(marginal, blocks, at))
-        for times in POLICY.structure_scales:
-            scale = np.concatenate([np.full(n, times), np.ones(covariance.directions[0].shape[1] - n)])
-            one = marginal.rescaled(scale)
-            likely = one.log_evidence(grams.rescaled(scale))
-            if likely > most:
-                best, most = one.covariance, likely
+        covariance = learned(at.problem, structure, share)
+        marginal = _marginal(covariance, blocks, at)
+        hyper, likely = marginal.likeliest(marginal.grams(_columns(marginal, blocks, at)), begin)
+        if likely > most:
+            best, most = (covariance, hyper), likely
     if best is None:
         raise WorkError(f"machine {at.machine.machine}: the likelihood of its recordings is not finite")
     return best
 
 
+def _marginal(covariance: Covariance, blocks: Sequence[Block], at: Point) -> Marginal:
+    return Marginal(covariance, [b.nuisance for b in blocks], at.nuisance, len(at.problem.nuisances.start_K))
+
+
 def _excess(fitted: Fitted) -> Array:
     """The sd (C,) of each channel's whitened rows; 1 where it is as it should be."""
-    left = fitted.marginal.leftover(fitted.columns, fitted.z, fitted.grams)
+    left = fitted.level.leftover(fitted.columns, fitted.z, fitted.grams)
     channels = np.concatenate([m.channel for m in fitted.problem.measured])
     rows = np.bincount(channels, minlength=len(fitted.problem.channels))
     squares = np.bincount(channels, np.concatenate(left) ** 2, minlength=len(rows))
@@ -215,13 +219,20 @@ def _columns(marginal: Marginal, blocks: Sequence[Block], at: Point) -> list[Arr
     return out
 
 
-def _fitted(at: Point, covariance: Covariance, runs: int) -> Fitted:
-    """A point under a covariance, at its optimum; the batches' own unknowns linearised there."""
+def _fitted(at: Point, covariance: Covariance, hyper: Hyper, runs: int) -> Fitted:
+    """A point under a covariance, at its optimum, the batches' own unknowns linearised where they are in that."""
+    begun = _begun(at, covariance, hyper, runs)
+    for _ in range(POLICY.own_rounds):
+        done = relinearised(begun, POLICY.baseline_steps)
+        begun = _begun(replace(done, nuisance=done.own), covariance, hyper, runs)
+    return begun
+
+
+def _begun(at: Point, covariance: Covariance, hyper: Hyper, runs: int) -> Fitted:
+    """A point under a covariance as it is; all that acts linearly is linearised there."""
     blocks = list(at.problem.linearise(at.x, at.nuisance))
-    marginal = Marginal(covariance, [b.nuisance for b in blocks], at.nuisance)
-    start = Fitted(**_fields(at), marginal=marginal, columns=_columns(marginal, blocks, at), runs=runs)
-    done = relinearised(start, POLICY.baseline_steps)
-    return replace(done, nuisance=done.own)
+    marginal = _marginal(covariance, blocks, at)
+    return Fitted(**_fields(at), marginal=marginal, hyper=hyper, columns=_columns(marginal, blocks, at), runs=runs)
 
 
 def _fields(at: Point) -> dict[str, Any]:
@@ -230,24 +241,41 @@ def _fields(at: Point) -> dict[str, Any]:
 
 def under(fitted: Fitted, covariance: Covariance) -> Fitted:
     """The fit under another covariance."""
-    return _fitted(fitted, covariance, fitted.runs)
+    return _fitted(fitted, covariance, fitted.hyper, fitted.runs)
+
+
+Model = Callable[[Array], list[Array]]  # the whitened derivatives (n_b, p) of every batch at z
 
 
 def relinearised(fitted: Fitted, steps: int = POLICY.fit_steps) -> Fitted:
     """The fit at its optimum, with all derivatives taken anew at every step."""
+    return _descended(fitted, _anew(fitted), steps)
+
+
+def _anew(fitted: Fitted) -> Model:
     problem, marginal, spread = fitted.problem, fitted.marginal, _spread(fitted.problem.unknowns)
 
     def model(z: Array) -> list[Array]:
         blocks = problem.linearise(x_of(problem.unknowns, z), fitted.nuisance)
         return marginal.white([block.jacobian * spread for block in blocks])
 
-    return _descended(fitted, model, steps)
+    return model
+
+
+def tuned(fitted: Fitted, model: Model | None = None, steps: int = POLICY.fit_steps) -> Fitted:
+    """The fit under the hyperparameters that are likeliest for it, at its optimum there."""
+    for _ in range(POLICY.hyper_rounds):
+        hyper, _ = fitted.marginal.likeliest(fitted.grams, fitted.hyper)
+        if hyper == fitted.hyper:
+            break
+        fitted = _descended(replace(fitted, hyper=hyper), model or _anew(fitted), steps)
+    return fitted
 
 
 def refitted(
     now: Fitted, part: TwinPart, at: Mapping[str, float] | None = None, steps: int = POLICY.fit_steps
 ) -> Fitted:
-    """The same recordings fitted by a changed twin part, starting from a fit.
+    """The same recordings fitted by a changed twin part, starting from a fit, under its own hyperparameters.
 
     Only what is new is linearised anew at every step: the derivatives by parameters that both share are those of the
     fit before (a chord). `at` gives start values by parameter name; other new parameters start at their value.
@@ -274,17 +302,17 @@ def refitted(
 
     z = np.clip(z, *z_bounds(problem.unknowns))
     begun = replace(now, part=part, problem=problem, z=z, nuisance=nuisance, base=now)
-    return _descended(begun, model, steps)
+    return tuned(_descended(begun, model, steps), model, steps)
 
 
-def _descended(fitted: Fitted, model: Callable[[Array], list[Array]], steps: int) -> Fitted:
+def _descended(fitted: Fitted, model: Model, steps: int) -> Fitted:
     """Gauss-Newton from a fit, with the whitened `model` (n_b, p) of every batch at z; a step is shortened until the
     posterior rises (Levenberg and Marquardt).
 
     Raises:
         WorkError: not finite at the start.
     """
-    problem, marginal, z = fitted.problem, fitted.marginal, fitted.z
+    problem, marginal, level, z = fitted.problem, fitted.marginal, fitted.level, fitted.z
     low, high = z_bounds(problem.unknowns)
 
     def rows(z: Array) -> tuple[list[Array], float]:
@@ -295,7 +323,7 @@ def _descended(fitted: Fitted, model: Callable[[Array], list[Array]], steps: int
             if not all(np.isfinite(r).all() for r in white):
                 return white, np.inf
             grams = marginal.grams([r[:, None] for r in white])
-            return white, float(marginal.reduced(grams)[0, 0] + z @ z)
+            return white, float(level.reduced(grams)[0, 0] + level.prior * (z @ z))
 
     def at(z: Array, left: Sequence[Array]) -> Fitted:
         columns = [np.column_stack([own, r + own @ z]) for own, r in zip(model(z), left, strict=True)]
@@ -306,8 +334,8 @@ def _descended(fitted: Fitted, model: Callable[[Array], list[Array]], steps: int
         raise WorkError(f"machine {fitted.machine.machine}: the twin cannot be simulated where a fit begins")
     here, damping = at(z, left), 0.0
     for _ in range(steps):
-        c = marginal.reduced(here.grams)
-        normal = c[:-1, :-1] + np.eye(len(z))
+        c = level.reduced(here.grams)
+        normal = c[:-1, :-1] + level.prior * np.eye(len(z))
         slope = c[:-1, -1] - normal @ z
         for _ in range(POLICY.damping_tries):
             moved = np.clip(z + np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slope), low, high)
@@ -340,9 +368,8 @@ class LeftOutRows:
 
 @lru_cache(maxsize=16)
 def plain(fitted: Fitted) -> Fitted:
-    """The same twin part calibrated to simulate alone: each channel's misfit is its noise, rows that repeat each other
-    count as one (`twin.calibration`), and some channels for more (`Fitted.weight`). What a machine file states is
-    simulated without structure.
+    """The same twin part calibrated to simulate alone: each channel's misfit is its noise, and rows that repeat each
+    other count as one (`twin.calibration`). What a machine file states is simulated without structure.
 
     Structure can hold a fit where no twin simulates well alone: where a misfit passes for noise, the likelier optimum
     is taken, from here and from where the twin that it was begun from simulates alone, or else the priors' means.
@@ -353,8 +380,7 @@ def plain(fitted: Fitted) -> Fitted:
     if misfits(noise_left(problem, state)):
         with suppress(WorkError, InputError):  # no machine has such values
             state = likelier(problem, state, _elsewhere(fitted))
-    one = calibrated(_moved(fitted, state), state.noise, fitted.runs)
-    return _weighted(one, np.array(fitted.weight)) if fitted.weight else one
+    return calibrated(_moved(fitted, state), state.noise, fitted.runs)
 
 
 def _elsewhere(fitted: Fitted) -> State:
@@ -369,24 +395,13 @@ def _elsewhere(fitted: Fitted) -> State:
     return annealed(problem, state, POLICY.plain_steps, tolerance)
 
 
-def _weighted(one: Fitted, weight: Array) -> Fitted:
-    """A `plain` fit in which channels count for more by factors (C,)."""
-    noise = replace(one.noise, factor=one.noise.factor / np.sqrt(weight))
-    state = State.at(one.problem, one.z, one.nuisance, noise)
-    state = descend(one.problem, state, POLICY.plain_steps, POLICY.fit_tolerance_nats)
-    return calibrated(_moved(one, state), noise, one.runs)
-
-
 def _moved(at: Point, state: State) -> Point:
-    return Point(at.machine, at.part, at.batches, at.problem, state.z, state.nuisance)
+    return Point(at.machine, at.part, at.batches, at.problem, state.z, state.nuisance, at.lead_rows)
 
 
 def calibrated(at: Point, noise: Noise, runs: int = 0) -> Fitted:
     """A calibrated point as a fit of independent rows."""
-    blocks = list(at.problem.linearise(at.x, at.nuisance))
-    covariance = independent(at.problem, 1.0 / np.sqrt(noise.weight))
-    marginal = Marginal(covariance, [b.nuisance for b in blocks], at.nuisance)
-    return Fitted(**_fields(at), marginal=marginal, columns=_columns(marginal, blocks, at), runs=runs)
+    return _begun(at, independent(at.problem, 1.0 / np.sqrt(noise.weight)), Hyper(), runs)
 
 
 @lru_cache(maxsize=16)
@@ -399,7 +414,7 @@ def _left_out(one: Fitted) -> LeftOutRows:
     problem, spread = one.problem, _spread(one.problem.unknowns)
     blocks = list(problem.linearise(one.x, one.nuisance))
     low, high = z_bounds(problem.unknowns)
-    every_z = [np.clip(one.marginal.optimum(one.grams, b), low, high) for b in range(len(blocks))]
+    every_z = [np.clip(one.level.optimum(one.grams, b), low, high) for b in range(len(blocks))]
     white = one.marginal.covariance.white
     nuisance = [
         v + own_step(white(k, b.nuisance), v, white(k, b.residual - b.jacobian @ (spread * (z - one.z))))
@@ -429,26 +444,6 @@ def worsened(before: LeftOutRows, after: LeftOutRows) -> dict[str, tuple[float, 
     rise, n = new.mean() - old.mean(), len(old)
     se = np.sqrt((old.var(ddof=min(1, n - 1)) + new.var(ddof=min(1, n - 1))) / n)
     return {str(c): (float(old[c].mean()), float(new[c].mean())) for c in rise.index[rise > se]}
-
-
-def unharmed(before: Fitted, after: Fitted) -> tuple[Fitted, dict[str, tuple[float, float]]]:
-    """The fit after, calibrated so that no channel is predicted worse than before, and the channels that still are.
-
-    What it adds lets it predict every channel as well; which of them it favours is a matter of weights. At first each
-    channel counts as it did before: what is explained better would count for more, and the others for less.
-    """
-    known = left_out_rows(before)
-    raised = worsened(known, left_out_rows(after))
-    if not raised:
-        return after, {}
-    one = plain(replace(after, weight=()))
-    weight = (one.noise.factor / plain(before).noise.factor) ** 2
-    for _ in range(POLICY.weight_rounds):
-        still = worsened(known, _left_out(_weighted(one, weight)))
-        if not still:
-            return replace(after, weight=tuple(weight.tolist())), {}
-        weight[[after.problem.channels.index(c) for c in still]] *= POLICY.weight_factor
-    return after, raised
 
 
 def _rows_left(problem: CalibrationProblem, every_z: Sequence[Array], nuisance: Sequence[Array]) -> LeftOutRows:

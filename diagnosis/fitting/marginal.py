@@ -1,34 +1,79 @@
 """Least squares under the covariance, with directions and the batches' own unknowns integrated out.
 
-Both act linearly and are linearised once, at the baseline. What is left of a model is a matrix of whitened columns;
-evidence, folds and steps follow from its Gram matrices (the arrow of `twin.calibration.arrow`, one border more).
+Both act linearly and are linearised once, at the baseline. All that follows (evidence, folds, steps) comes from raw
+Gram matrices of whitened columns. The sizes of what is integrated out are hyperparameters (`Hyper`): another value
+scales rows and columns of the Grams, so that every hypothesis is judged at its own likeliest ones for a few Cholesky
+factors (type II maximum likelihood, Good 1965; empirical Bayes, MacKay 1992, Neural Computation 4, 415).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from copy import copy
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from data.arrays import Array
+from data.arrays import Array, Mask
 from diagnosis.fitting.covariance import Covariance
+from diagnosis.policy import POLICY
+
+TINY = 1e-300
+
+
+@dataclass(frozen=True)
+class Hyper:
+    """Sizes of what is integrated out: of refined twins' structure, of imperfections, of the bodies' starts.
+
+    Factors on what was drawn, on the policy's sd, on the machine file's `initial_spread` and on the spreads of its
+    values: those of lumps are effective ones, which a drawing does not state.
+    """
+
+    structure: float = 1.0
+    imperfections: float = 1.0
+    starts: float = 1.0
+    values: float = 1.0
+
+    def near(self) -> Iterator[Hyper]:
+        """Those one step of the grid away, one size at a time."""
+        for name, grid in {
+            "structure": POLICY.structure_scales, "imperfections": POLICY.imperfection_scales,
+            "starts": POLICY.start_scales, "values": POLICY.value_scales,
+        }.items():  # fmt: skip
+            k = grid.index(getattr(self, name))
+            yield from (replace(self, **{name: grid[j]}) for j in (k - 1, k + 1) if 0 <= j < len(grid))
 
 
 @dataclass(frozen=True, eq=False)
 class Grams:
-    """Per batch products of m whitened columns with each other, (B, m, m), and with the K directions, (B, K, m)."""
+    """Per batch products of m whitened columns: with each other (B, m, m), with the K directions (B, K, m) and with the
+    batch's own unknowns, (q_b, m) each."""
 
     inner: Array
-    cross: Array
+    along: Array
+    own: list[Array]
 
-    def rescaled(self, scale: Array) -> Grams:
-        """The same with directions times `scale` (K,)."""
-        return Grams(self.inner, self.cross * scale[:, None])
+
+@dataclass(frozen=True, eq=False)
+class Many:
+    """Products of C whitened candidate columns: with a model's m columns (m, C) and the directions (K, C), both summed
+    over the batches, with each batch's own unknowns (q_b, C), and of each with itself (C,)."""
+
+    mixed: Array
+    along: Array
+    own: list[Array]
+    squares: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Of C candidate columns beyond all that is integrated out: `left`, their squares (C,), `residual`, their products
+    with the residual (C,), and by how much the parameters move for a unit of each, `shadow` (p, C)."""
+
+    left: Array
+    residual: Array
+    shadow: Array
 
 
 class Marginal:
@@ -37,33 +82,25 @@ class Marginal:
     Args:
         own: by batch the derivatives (n_b, q_b) by its own unknowns, of prior N(0, 1).
         at: their values (q_b,) where they were linearised.
+        starts: how many of them, the first ones, are starts of bodies.
     """
 
-    def __init__(self, covariance: Covariance, own: Sequence[Array], at: Sequence[Array]) -> None:
-        self.covariance = covariance
+    def __init__(self, covariance: Covariance, own: Sequence[Array], at: Sequence[Array], starts: int) -> None:
+        self.covariance, self.starts = covariance, starts
         self.offset = [n @ v for n, v in zip(own, at, strict=True)]
-        self._own = [covariance.white(b, n) for b, n in enumerate(own)]
-        self._root = [np.linalg.cholesky(n.T @ n + np.eye(n.shape[1])) for n in self._own]
-        self._along = [covariance.white(b, d) for b, d in enumerate(covariance.directions)]
-        self._taken = [self._beyond(b, d) for b, d in enumerate(self._along)]
-        self.directions = np.stack(
-            [d.T @ d - t.T @ t for d, t in zip(self._along, self._taken, strict=True)]
-        )  # (B, K, K)
-        self._volume = np.array([2.0 * float(np.log(np.diag(r)).sum()) for r in self._root])
+        self.own = [covariance.white(b, n) for b, n in enumerate(own)]
+        self.along = [covariance.white(b, d) for b, d in enumerate(covariance.directions)]
+        self.own_own = [n.T @ n for n in self.own]
+        self.own_along = [n.T @ d for n, d in zip(self.own, self.along, strict=True)]
+        self.along_along = np.stack([d.T @ d for d in self.along])
+        self._levels: dict[Hyper, Level] = {}
 
-    def rescaled(self, scale: Array) -> Marginal:
-        """The same with directions times `scale` (K,)."""
-        out = copy(self)
-        out.covariance = replace(self.covariance, directions=tuple(d * scale for d in self.covariance.directions))
-        out._along, out._taken = [d * scale for d in self._along], [d * scale for d in self._taken]
-        out.directions = self.directions * scale * scale[:, None]
-        for name in ("factor", "folds"):
-            out.__dict__.pop(name, None)
-        return out
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_levels": {}}
 
     @property
     def batches(self) -> int:
-        return len(self._own)
+        return len(self.own)
 
     def white(self, rows: Sequence[Array]) -> list[Array]:
         """Rows (n_b, …) of every batch under the blocks alone."""
@@ -71,82 +108,148 @@ class Marginal:
 
     def grams(self, columns: Sequence[Array]) -> Grams:
         """Of whitened columns (n_b, m) of every batch."""
-        inner, cross = [], []
-        for b, x in enumerate(columns):
-            taken = self._beyond(b, x)
-            inner.append(x.T @ x - taken.T @ taken)
-            cross.append(self._along[b].T @ x - self._taken[b].T @ taken)
-        return Grams(np.stack(inner), np.stack(cross))
+        inner = np.stack([x.T @ x for x in columns])
+        along = np.stack([d.T @ x for d, x in zip(self.along, columns, strict=True)])
+        return Grams(inner, along, [n.T @ x for n, x in zip(self.own, columns, strict=True)])
 
-    def products(self, columns: Sequence[Array], others: Sequence[Array]) -> tuple[Array, Array, Array]:
-        """Of few columns (n_b, m) with many (n_b, C), summed over the batches: (m, C), with the directions (K, C), and
-        the many with themselves (C,)."""
-        mixed: Any = 0.0
-        cross: Any = 0.0
-        squares: Any = 0.0
-        for b, (x, y) in enumerate(zip(columns, others, strict=True)):
-            one, other = self._beyond(b, x), self._beyond(b, y)
-            mixed = mixed + x.T @ y - one.T @ other
-            cross = cross + self._along[b].T @ y - self._taken[b].T @ other
-            squares = squares + np.einsum("nc,nc->c", y, y) - np.einsum("nc,nc->c", other, other)
-        return np.asarray(mixed), np.asarray(cross), np.asarray(squares)
+    def many(self, columns: Sequence[Array], others: Sequence[Array]) -> Many:
+        """Of whitened columns (n_b, m) of a model with many others (n_b, C)."""
+        pairs = list(zip(columns, others, strict=True))
+        mixed = np.sum([x.T @ y for x, y in pairs], axis=0)
+        along = np.sum([d.T @ y for d, y in zip(self.along, others, strict=True)], axis=0)
+        own = [n.T @ y for n, y in zip(self.own, others, strict=True)]
+        return Many(mixed, along, own, np.sum([np.einsum("nc,nc->c", y, y) for y in others], axis=0))
 
-    def _beyond(self, b: int, rows: Array) -> Array:
-        return solve_triangular(self._root[b], self._own[b].T @ rows, lower=True)
+    def level(self, hyper: Hyper) -> Level:
+        """All of it at these hyperparameters; kept, since every hypothesis of a round asks for the same few."""
+        if hyper not in self._levels:
+            self._levels[hyper] = Level(self, hyper)
+        return self._levels[hyper]
+
+    def likeliest(self, grams: Grams, begin: Hyper) -> tuple[Hyper, float]:
+        """The hyperparameters of the largest log evidence of columns [model (p), target], up the hill from `begin`."""
+        best, most = begin, self.level(begin).log_evidence(grams)
+        seen = {begin}
+        while True:
+            ahead = [h for h in best.near() if h not in seen]
+            seen |= set(ahead)
+            level = {h: self.level(h).log_evidence(grams) for h in ahead}
+            top = max(level, key=lambda h: level[h], default=best)
+            if not level or level[top] <= most:
+                return best, most
+            best, most = top, level[top]
+
+
+class Level:
+    """A `Marginal` at one set of hyperparameters."""
+
+    def __init__(self, of: Marginal, hyper: Hyper) -> None:
+        self.of, covariance = of, of.covariance
+        size = np.ones(covariance.count)
+        size[: covariance.drawn], size[covariance.drawn :] = hyper.structure, hyper.imperfections
+        self.prior = 1.0 / hyper.values**2  # precision of the model's parameters z
+        self.size = size
+        self.own_size = [np.where(np.arange(len(n)) < of.starts, hyper.starts, 1.0) for n in of.own_own]
+        self._root = [
+            np.linalg.cholesky(n * s * s[:, None] + np.eye(len(n)))
+            for n, s in zip(of.own_own, self.own_size, strict=True)
+        ]
+        self._taken = [self.beyond(b, d) * size for b, d in enumerate(of.own_along)]
+        information = [
+            d * size * size[:, None] - t.T @ t for d, t in zip(of.along_along, self._taken, strict=True)
+        ]
+        self.information = np.stack(information)  # (B, K, K)
+        self._volume = np.array([2.0 * float(np.log(np.diag(r)).sum()) for r in self._root]) + covariance.log_det
+
+    def beyond(self, b: int, own: Array) -> Array:
+        """What a batch's own unknowns take of columns, from their products (q_b, m) with these."""
+        return solve_triangular(self._root[b], own * self.own_size[b][:, None], lower=True)
 
     @cached_property
     def factor(self) -> tuple[Array, bool]:
         """Cholesky of the directions' information and prior in all batches."""
-        return self._factor(np.ones(self.batches, bool))
+        return self._factor(np.ones(self.of.batches, bool))
 
     @cached_property
     def folds(self) -> list[tuple[Array, bool]]:
         """The same without each batch in turn."""
-        every = ~np.eye(self.batches, dtype=bool)
-        return [self._factor(kept) for kept in every]
+        return [self._factor(kept) for kept in ~np.eye(self.of.batches, dtype=bool)]
 
-    def _factor(self, kept: Array) -> tuple[Array, bool]:
-        information = self.directions[kept].sum(axis=0)
+    def _factor(self, kept: Mask) -> tuple[Array, bool]:
+        information = self.information[kept].sum(axis=0)
         return cho_factor(information + np.eye(len(information)), lower=True)
+
+    def products(self, grams: Grams) -> tuple[Array, Array]:
+        """Products (B, m, m) of columns with each other and (B, K, m) with the directions, own unknowns taken out."""
+        inner, cross = grams.inner.copy(), grams.along * self.size[:, None]
+        for b, own in enumerate(grams.own):
+            taken = self.beyond(b, own)
+            inner[b] -= taken.T @ taken
+            cross[b] -= self._taken[b].T @ taken
+        return inner, cross
 
     def reduced(self, grams: Grams, without: int | None = None) -> Array:
         """Products (m, m) of the columns with the directions integrated out, in all batches or without one."""
-        inner, cross, factor = grams.inner.sum(axis=0), grams.cross.sum(axis=0), self.factor
+        return self._reduced(*self.products(grams), without)
+
+    def _reduced(self, each_inner: Array, each_cross: Array, without: int | None = None) -> Array:
+        inner, cross, factor = each_inner.sum(axis=0), each_cross.sum(axis=0), self.factor
         if without is not None:
-            inner, cross, factor = inner - grams.inner[without], cross - grams.cross[without], self.folds[without]
+            inner, cross, factor = inner - each_inner[without], cross - each_cross[without], self.folds[without]
         return np.asarray(inner - cross.T @ cho_solve(factor, cross))
 
-    def log_evidence(self, grams: Grams, without: int | None = None) -> float:
-        """Log marginal likelihood, up to a constant, of columns [model (p), target]: parameters of prior N(0, 1)
-        integrated out; in all batches or without one."""
-        c = self.reduced(grams, without)
-        root = np.linalg.cholesky(c[:-1, :-1] + np.eye(len(c) - 1))
+    def log_evidence(self, grams: Grams) -> float:
+        """Log marginal likelihood, up to a constant, of columns [model (p), target]: parameters of prior N(0, `values`²)
+        integrated out."""
+        return self._log_evidence(self.products(grams))
+
+    def _log_evidence(self, products: tuple[Array, Array], without: int | None = None) -> float:
+        c = self._reduced(*products, without)
+        root = np.linalg.cholesky(c[:-1, :-1] + self.prior * np.eye(len(c) - 1))
         fitted = solve_triangular(root, c[:-1, -1], lower=True)
         factor = self.factor if without is None else self.folds[without]
-        volume = self._volume + self.covariance.log_det
-        logs = 2.0 * float(np.log(np.diag(root)).sum() + np.log(np.diag(factor[0])).sum()) + float(volume.sum())
+        logs = 2.0 * float(np.log(np.diag(root)).sum() + np.log(np.diag(factor[0])).sum()) + float(self._volume.sum())
+        logs -= (len(c) - 1) * np.log(self.prior)
         if without is not None:
-            logs -= float(volume[without])
+            logs -= float(self._volume[without])
         return -0.5 * (float(c[-1, -1] - fitted @ fitted) + logs)
 
     def foretold(self, grams: Grams) -> Array:
         """Log density (B,) of every batch, predicted from all others."""
-        whole = self.log_evidence(grams)
-        return np.array([whole - self.log_evidence(grams, b) for b in range(self.batches)])
+        products = self.products(grams)
+        whole = self._log_evidence(products)
+        return np.array([whole - self._log_evidence(products, b) for b in range(self.of.batches)])
+
+    def screened(self, grams: Grams, many: Many) -> Scores:
+        """Candidate columns as further parameters of a model [model (p), target] at its optimum."""
+        inner, cross = (x.sum(axis=0) for x in self.products(grams))
+        mixed, along, squares = many.mixed.copy(), many.along * self.size[:, None], many.squares.copy()
+        for b, own in enumerate(many.own):
+            other = self.beyond(b, own)
+            mixed -= self.beyond(b, grams.own[b]).T @ other
+            along -= self._taken[b].T @ other
+            squares -= np.einsum("qc,qc->c", other, other)
+        by_directions = cho_solve(self.factor, np.hstack([along, cross]))
+        mixed -= cross.T @ by_directions[:, : along.shape[1]]
+        squares -= np.einsum("kc,kc->c", along, by_directions[:, : along.shape[1]])
+        c = inner - cross.T @ by_directions[:, along.shape[1] :]
+        shadow = np.linalg.solve(c[:-1, :-1] + self.prior * np.eye(len(c) - 1), mixed[:-1])
+        left = np.maximum(squares - np.einsum("pc,pc->c", mixed[:-1], shadow), TINY)
+        return Scores(left, mixed[-1] - shadow.T @ c[:-1, -1], shadow)
 
     def optimum(self, grams: Grams, without: int | None = None) -> Array:
         """z (p,) of columns [model (p), target]."""
         c = self.reduced(grams, without)
-        return np.asarray(np.linalg.solve(c[:-1, :-1] + np.eye(len(c) - 1), c[:-1, -1]), float)
+        return np.asarray(np.linalg.solve(c[:-1, :-1] + self.prior * np.eye(len(c) - 1), c[:-1, -1]), float)
 
     def leftover(self, columns: Sequence[Array], z: Array, grams: Grams) -> list[Array]:
         """Whitened rows (n_b,) left of the target in columns [model (p), target] at z and at the likeliest directions
         and own unknowns."""
-        aim = np.append(-z, 1.0)
-        along = cho_solve(self.factor, grams.cross.sum(axis=0) @ aim)
+        of, aim = self.of, np.append(-z, 1.0)
+        along = self.size * cho_solve(self.factor, self.products(grams)[1].sum(axis=0) @ aim)
         out = []
         for b, x in enumerate(columns):
-            rest = x @ aim - self._along[b] @ along
-            own = solve_triangular(self._root[b], self._beyond(b, rest), lower=True, trans="T")
-            out.append(rest - self._own[b] @ own)
+            rest = x @ aim - of.along[b] @ along
+            own = solve_triangular(self._root[b], self.beyond(b, (of.own[b].T @ rest)[:, None]), lower=True, trans="T")
+            out.append(rest - of.own[b] @ (self.own_size[b] * own[:, 0]))
         return out

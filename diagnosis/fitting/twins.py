@@ -164,8 +164,9 @@ def _webs(bodies: Mapping[str, Body], cut: Sequence[str], through: Mapping[str, 
     out = {}
     if rng.random() < POLICY.webbed_share:
         for name in cut:
-            for k in range(int(bodies[name].cells)):  # type: ignore[arg-type]
-                one, other = rng.uniform(0.0, 1.0, 2)
+            cells = int(bodies[name].cells)  # type: ignore[arg-type]
+            for k in range(cells):
+                one, other = (rng.permutation(cells)[:2] + 0.5) / cells  # of two cells: a link needs two ends
                 share = through[name] * rng.uniform(*POLICY.web_conductance)
                 out[f"web_{name}_{k}"] = _link(f"{name}@{one:.6f}", f"{name}@{other:.6f}", share)
     return out

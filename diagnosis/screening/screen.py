@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,16 +12,17 @@ from scipy.special import log_ndtr
 
 from data.arrays import Array
 from diagnosis.candidates.alternatives import alternatives
+from diagnosis.candidates.discretisation import never_reported
 from diagnosis.candidates.library import candidates
 from diagnosis.contracts import COLUMNS, Candidate, Fitted, Scored
 from diagnosis.fitting.covariance import slices_of
+from diagnosis.fitting.marginal import TINY, Hyper
 from diagnosis.policy import POLICY
 from diagnosis.screening.signatures import Signatures, signatures
 from twin.mechanisms import MECHANISMS
 from twin.quantity import Spec, Value, convert
 
-SCANNED = ("draught", "floor_sink")  # laws that are screened at several values of their shape
-TINY = 1e-300
+SCANNED = ("draught", "floor_sink", "sun")  # laws that are screened at several values of their shape
 NO_TRACE = 1e-9  # given noises: a signature below it is rounding
 
 
@@ -29,19 +30,12 @@ NO_TRACE = 1e-9  # given noises: a signature below it is rounding
 class Screen:
     """All candidates that have a signature, best first, and why others have none.
 
-    `shadow` (p, C) is by how much the fit's parameters z move for a unit of each column of the signatures; `null`
-    (T, C) what each gains on recordings of refined twins that are left out of the covariance, with nothing missing.
+    `shadow` (p, C) is by how much the fit's parameters z move for a unit of each column of the signatures.
     """
 
     scored: tuple[Scored, ...]
     signatures: Signatures
     shadow: Array
-    null: Array
-
-    def null_gains(self, names: Collection[str]) -> Array:
-        """The largest gain (T,) of the named candidates on each refined twin."""
-        columns = [k for n in names for k in self.signatures.of.get(n, ()) if not self.signatures.whole[k]]
-        return self.null[:, columns].max(axis=1, initial=0.0)
 
 
 def proposed(fitted: Fitted) -> list[Candidate]:
@@ -56,7 +50,11 @@ def proposed(fitted: Fitted) -> list[Candidate]:
         *(w for c in laws if not c.variant_of for w in _windows(c, hours)),
         *alternatives(fitted.problem.network),
     ]
-    return [c for c in every if not (c.variant_of and c.mechanism not in SCANNED) and not _between_bodies(c, fitted)]
+    never = never_reported(every, fitted)
+    return [
+        c for c in every
+        if c.name not in never and not (c.variant_of and c.mechanism not in SCANNED) and not _between_bodies(c, fitted)
+    ]  # fmt: skip
 
 
 def _windows(c: Candidate, run_h: float) -> Iterator[Candidate]:
@@ -84,23 +82,28 @@ def screen(fitted: Fitted, every: Sequence[Candidate], before: Screen | None = N
     """Log evidence that each candidate adds, its amplitude integrated out (a score test, Cox and Hinkley 1974, §9.3).
 
     The prior of an amplitude is so wide that its signature is `screen_amplitude_noises` in the channel that it changes
-    most: the same for heat and for a lever. A finite change is whole or not at all. Signatures of a screen `before`,
-    at a fit with fewer effects, are used again.
+    most: the same for heat and for a lever. A finite change is whole or not at all. Each candidate is judged under the
+    likeliest for it of the hyperparameters that leave an effect more room. Signatures of a screen `before`, at a fit
+    with fewer effects, are used again.
     """
     seen, marginal = signatures(fitted, every, before.signatures if before else None), fitted.marginal
-    mixed_raw, cross, squares = marginal.products(fitted.columns, marginal.white(seen.columns))
-    along = cho_solve(marginal.factor, cross)
-    mixed = mixed_raw - fitted.grams.cross.sum(axis=0).T @ along  # (p + 1, C)
-    beyond = squares - np.einsum("kc,kc->c", cross, along)
-    c = marginal.reduced(fitted.grams)
-    shadow = np.linalg.solve(c[:-1, :-1] + np.eye(len(c) - 1), mixed[:-1])
-    left = np.maximum(beyond - np.einsum("pc,pc->c", mixed[:-1], shadow), TINY)
-    with_residual = mixed[-1] - shadow.T @ c[:-1, -1]
+    many = marginal.many(fitted.columns, marginal.white(seen.columns))
     prior = POLICY.screen_amplitude_noises / np.maximum(_largest_rms(fitted, seen), NO_TRACE)
     positive = _positive(every, seen)
-    gain, amplitude = _gains(left, with_residual, prior, positive)
-    null = _null(fitted, mixed_raw, cross, squares, prior, positive)
-    gain[seen.whole] = (with_residual - 0.5 * left)[seen.whole]
+    gain = np.full(len(prior), -np.inf)
+    amplitude, sd = np.zeros_like(prior), np.zeros_like(prior)
+    for hyper in roomier(fitted.hyper):
+        level = marginal.level(hyper)
+        scores = level.screened(fitted.grams, many)
+        more, mean = _gains(scores.left, scores.residual, prior, positive)
+        more[seen.whole] = (scores.residual - 0.5 * scores.left)[seen.whole]
+        more += level.log_evidence(fitted.grams) - fitted.log_evidence
+        if hyper == fitted.hyper:
+            own = scores
+        better = more > gain
+        gain[better], amplitude[better] = more[better], mean[better]
+        sd[better] = 1.0 / np.sqrt(scores.left[better])
+    absorbed = 1.0 - own.left / np.maximum(many.squares, TINY)
     scored = []
     for one in every:
         columns = seen.of.get(one.name)
@@ -109,10 +112,16 @@ def screen(fitted: Fitted, every: Sequence[Candidate], before: Screen | None = N
         k = max(columns, key=lambda k: gain[k])
         name = (*one.amplitudes, "factor")[columns.index(k)]
         scored.append(
-            Scored(one, float(gain[k]), float(1.0 - left[k] / max(squares[k], TINY)), {name: float(amplitude[k])},
-                   float(1.0 / np.sqrt(left[k])), k)
+            Scored(one, float(gain[k]), float(absorbed[k]), {name: float(amplitude[k])}, float(sd[k]), k)
         )  # fmt: skip
-    return Screen(tuple(sorted(scored, key=lambda s: (-s.gain, s.candidate.name))), seen, shadow, null)
+    return Screen(tuple(sorted(scored, key=lambda s: (-s.gain, s.candidate.name))), seen, own.shadow)
+
+
+def roomier(hyper: Hyper) -> list[Hyper]:
+    """These hyperparameters, and those with less structure and starts nearer to the first readings."""
+    scales = [s for s in POLICY.structure_scales if s <= hyper.structure][-POLICY.screened_scales :]
+    starts = [s for s in POLICY.start_scales if s <= hyper.starts]
+    return [replace(hyper, structure=s, starts=t) for s in scales for t in starts]
 
 
 def _gains(left: Array, with_residual: Array, prior: Array, positive: Array) -> tuple[Array, Array]:
@@ -121,33 +130,6 @@ def _gains(left: Array, with_residual: Array, prior: Array, positive: Array) -> 
     mean = with_residual / precision
     gain = 0.5 * with_residual * mean - 0.5 * np.log(prior**2 * precision)
     return np.where(positive, gain + np.log(2.0) + log_ndtr(mean * np.sqrt(precision)), gain), mean
-
-
-def _null(fitted: Fitted, mixed: Array, cross: Array, squares: Array, prior: Array, positive: Array) -> Array:
-    """Gains (T, C) where the recordings are those of a refined twin, left out of the directions in turn, and noise."""
-    p, twins = len(fitted.z), POLICY.refined_twins
-    of_model = fitted.grams.cross.sum(axis=0)[:, :p]  # (K, p)
-    inner = fitted.grams.inner.sum(axis=0)[:p, :p]
-    directions = fitted.marginal.directions.sum(axis=0)
-    rng = np.random.default_rng(0)
-    out = np.zeros((twins, cross.shape[1]))
-    joint = np.block([[inner, of_model.T], [of_model, directions]])
-    shared = np.vstack([mixed[:p], cross])
-    drawn = min(twins, len(directions))  # none where noise alone is judged
-    for fold in range(POLICY.null_folds):
-        dropped = np.arange(fold, twins, POLICY.null_folds)
-        keep = np.ones(len(joint))
-        of = dropped[dropped < drawn]
-        keep[p : p + drawn] *= np.sqrt(twins / (twins - len(dropped)))
-        keep[p + of] = 0.0
-        factor = cho_factor(joint * keep[:, None] * keep + np.eye(len(joint)))
-        along = cho_solve(factor, shared * keep[:, None])
-        left = np.maximum(squares - np.einsum("kc,kc->c", shared * keep[:, None], along), TINY)
-        size = np.sqrt(twins)  # a direction is a draw of sd 1 / sqrt(twins)
-        shown = np.zeros((len(dropped), cross.shape[1]))
-        shown[: len(of)] = size * (cross[of] - (joint[p + of] * keep) @ along)
-        out[dropped] = _gains(left, shown + rng.standard_normal(shown.shape) * np.sqrt(left), prior, positive)[0]
-    return out
 
 
 def _positive(every: Sequence[Candidate], seen: Signatures) -> Array:
@@ -173,8 +155,8 @@ def likeness(fitted: Fitted, seen: Screen, scored: Sequence[Scored]) -> Array:
     which = [s.column for s in scored]
     white = marginal.white([x[:, which] for x in seen.signatures.columns])
     every = [np.hstack([x[:, :-1], w]) for x, w in zip(fitted.columns, white, strict=True)]
-    c = marginal.reduced(marginal.grams(every))
-    gram = c[p:, p:] - c[p:, :p] @ cho_solve(cho_factor(c[:p, :p] + np.eye(p)), c[:p, p:])
+    c = fitted.level.reduced(marginal.grams(every))
+    gram = c[p:, p:] - c[p:, :p] @ cho_solve(cho_factor(c[:p, :p] + fitted.level.prior * np.eye(p)), c[:p, p:])
     size = np.sqrt(np.maximum(np.diag(gram), TINY))
     return np.asarray(np.abs(gram) / np.outer(size, size))
 

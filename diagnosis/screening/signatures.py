@@ -16,7 +16,7 @@ from data.arrays import Array, Mask
 from data.errors import InputError, WorkError
 from data.machine import Machine
 from diagnosis.candidates.alternatives import alternatives
-from diagnosis.candidates.discretisation import SLACK_MECHANISMS, paths_that_rise, slack
+from diagnosis.candidates.discretisation import SLACK_MECHANISMS, films_that_rise, slack
 from diagnosis.candidates.library import candidates
 from diagnosis.contracts import Candidate, CandidateKind, Point
 from diagnosis.fitting.carried import carried_nuisances, carried_z, on_network
@@ -199,15 +199,22 @@ def signatures(at: Point, every: Sequence[Candidate], known: Signatures | None =
 
 
 def imperfections(at: Point) -> list[Array]:
-    """What sensors, clocks, films and lengths of any machine are off by, (n_b, K) of every batch per sd of each."""
+    """What sensors and lengths of any machine are off by, (n_b, K) of every batch per sd of each."""
     every = candidates(at.machine, at.part, SLACK_MECHANISMS) + alternatives(at.problem.network)
-    rising = paths_that_rise(at)
-    sd = slack(every, at) | {c.name: sd for c, sd in rising}
-    every += [c for c, _ in rising]
+    sd = slack(every, at)
     own = [c for c in every if c.name in sd and (c.amplitudes or c.change)]
     seen = signatures(at, own)
     which = [(seen.of[c.name][0], sd[c.name]) for c in own if c.name in seen.of]
     scale = np.array([s for _, s in which])
+    return [x[:, [k for k, _ in which]] * scale for x in seen.columns]
+
+
+def rising_films(at: Point) -> list[Array]:
+    """What every film that rises with its temperature difference shows, (n_b, E) of every batch per sd of its size."""
+    every = films_that_rise(at)
+    seen = signatures(at, [c for c, _ in every])
+    which = [(seen.of[c.name][0], sd) for c, sd in every if c.name in seen.of]
+    scale = np.array([sd for _, sd in which])
     return [x[:, [k for k, _ in which]] * scale for x in seen.columns]
 
 

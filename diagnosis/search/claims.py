@@ -1,7 +1,9 @@
-"""How probable a claim is: a logistic model of how much less the twin leaves with it.
+"""How probable a claim is: a logistic model of figures that are free of scale.
 
-What wrong claims gain grows with what the network cannot represent, and reaches thousands of nats; they remove
-little of that. Offset and weight are a fit to development cases of six kinds of machines (`results/claims.csv`).
+What a wrong claim gains in nats grows with the recordings and with what a network cannot represent. So a claim is judged
+by what it gains relative to the log evidence of the fit before it, by the odds of its mechanism, by its lead over the
+best explanation that differs in place and mechanism, and by the share of runs that it predicts better. The weights are
+fitted to development cases of several kinds of machine (`results/claims.csv`).
 """
 
 from __future__ import annotations
@@ -12,30 +14,55 @@ from typing import Any
 
 import numpy as np
 
-from data.arrays import Array
 from diagnosis.contracts import Fitted, Tried
-from diagnosis.fitting.fitted import plain
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen
 
 
 @dataclass(frozen=True)
-class Round:
-    """One round: all that was tried, the claim first, and how probable it is.
+class Figures:
+    """What a claim is judged by; none has a unit.
 
-    `null` (T,) are the largest gains on refined twins with nothing missing, in nats; `fall` of what the twin leaves;
-    `raised` channels by which the claim was refused, with rms before and after; `resolved` channels that show what is
-    impossible without it; `forms` the terms (`free_forms.Form`) of candidates of no listed mechanism.
+    `relative_gain`: nats gained over the absolute log evidence of the fit before. `log_odds` of the mechanism before the
+    recordings. `lead`: share of the gain that the best different explanation lacks. `agreeing`: share of the runs.
+    """
+
+    relative_gain: float
+    log_odds: float
+    lead: float
+    agreeing: float
+
+    @property
+    def probability(self) -> float:
+        """That the claim is true."""
+        return float(1.0 / (1.0 + np.exp(-self._score(np.log(max(self.relative_gain, 1e-9))))))
+
+    def _score(self, log_gain: float) -> float:
+        offset, *weights = POLICY.claim_weights
+        return offset + float(np.dot(weights, [log_gain, self.log_odds, self.lead, self.agreeing]))
+
+    @property
+    def least_relative_gain(self) -> float:
+        """The relative gain from which on a claim with these other figures is made."""
+        p = POLICY.claim_min_probability
+        return float(np.exp((np.log(p / (1.0 - p)) - self._score(0.0)) / POLICY.claim_weights[1]))
+
+
+PLAIN = Figures(1.0, 0.0, 1.0, 1.0)  # of a claim that nothing but its size speaks against
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round: all that was tried, the likeliest first, and how probable it is.
+
+    `resolved`: channels that show what is impossible without the claim; `forms`: the terms (`free_forms.Form`) of
+    candidates of no listed mechanism.
     """
 
     before: Fitted
     screen: Screen
     tried: tuple[Tried, ...]
-    null: Array
-    trust: float
-    accepted: bool
-    fall: float = 0.0
-    raised: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    figures: Figures | None = None
     resolved: frozenset[str] = frozenset()
     forms: Mapping[str, Any] = field(default_factory=dict)
 
@@ -44,35 +71,43 @@ class Round:
         return self.tried[0] if self.tried else None
 
     @property
-    def threshold(self) -> float:
-        """Nats that structure alone gains in one of a hundred refined twins (Gumbel 1958)."""
-        return null_quantile(self.null)
+    def trust(self) -> float:
+        """The probability that the first is true, or one that recordings cannot distinguish from it."""
+        if self.figures is None:
+            return 0.0
+        return POLICY.max_probability if self.resolved else self.figures.probability
 
     @property
-    def removed(self) -> float:
-        """Share of the rms misfit that goes with the claim, geometric mean over channels; its `fall` in other words."""
-        return float(1.0 - np.exp(-self.fall))
+    def accepted(self) -> bool:
+        return self.trust >= POLICY.claim_min_probability
+
+    @property
+    def threshold(self) -> float:
+        """Nats from which on an effect that nothing else resembles would be claimed."""
+        return PLAIN.least_relative_gain * abs(self.before.log_evidence)
 
 
-def null_quantile(null: Array) -> float:
-    """The 99 % quantile of largest gains (T,) by a Gumbel distribution of their mean and spread."""
-    scale = float(np.std(null, ddof=1)) * np.sqrt(6.0) / np.pi
-    return float(np.mean(null) - scale * (np.euler_gamma + np.log(-np.log(POLICY.chance_quantile))))
+def figures(before: Fitted, tried: Sequence[Tried]) -> Figures:
+    """Of the first of those that were tried."""
+    first = tried[0]
+    gain = max(first.gain, 1e-9)
+    other = max((t.gain for t in tried[1:] if differs(first, t)), default=0.0)
+    lead = float(np.clip(1.0 - other / gain, -1.0, 1.0))
+    return Figures(gain / abs(before.log_evidence), first.log_prior, lead, first.improved / len(first.by_run))
 
 
-def fall(before: Fitted, after: Fitted) -> float:
-    """How much less the fit after leaves: ln(rms before / rms after), the mean over channels; 0.1 is a tenth less.
-
-    Rms is not counted below noise. Of two predictions each channel counts the one that falls less: by the values of the
-    fit under structure, and by those of the `plain` fit. A wrong claim may improve one by harming the other.
-    """
-    pairs = (before, after), (plain(before), plain(after))
-    return float(np.min([np.log(a.noise.factor / b.noise.factor) for a, b in pairs], axis=0).clip(min=0.0).mean())
+def differs(one: Tried, other: Tried) -> bool:
+    """Whether another explanation has another mechanism at another place, and recordings can distinguish the two."""
+    a, b = one.candidate, other.candidate
+    return a.mechanism != b.mechanism and a.where.name != b.where.name and one.cluster != other.cluster
 
 
-def trust(fallen: float) -> float:
-    """The probability that a claim with this `fall` is true."""
-    return float(1.0 / (1.0 + np.exp(-POLICY.claim_offset - POLICY.claim_weight * fallen)))
+def alike(one: Tried, other: Tried) -> bool:
+    """Whether a user acts on both explanations alike: recordings cannot distinguish them, or they are of one place and
+    nearly as likely."""
+    same_place = one.candidate.where == other.candidate.where
+    close = abs(one.standing - other.standing) < POLICY.settling_nats
+    return one.cluster == other.cluster or (same_place and close)
 
 
 @dataclass(frozen=True)
@@ -93,13 +128,13 @@ def probability_cap(runs: int) -> float:
 def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     """Of a round's candidates, the claim first; then of nothing, and of something that is not listed: they add to 1.
 
-    The claim, with all that these recordings cannot distinguish from it, has the probability that the calibrated model
-    gives. The rest is shared in proportion to gains and odds, tempered by what structure scatters gains by; nothing is
-    as likely as an effect that gains what structure does.
+    The claim, with all that is alike, has the probability of its figures. The rest is shared in proportion to gains and
+    odds, tempered by what structure scatters gains by; nothing is as likely as an effect that would just be claimed.
     """
     runs = done.before.runs or len(done.before.batches)
     best = done.best
-    scale = max(POLICY.temperature_null_share * done.threshold, POLICY.temperature_min_nats)
+    top = best.standing if best is not None else 0.0
+    scale = max(POLICY.temperature_share * max(top, done.threshold), POLICY.temperature_min_nats)
     other = done.threshold - np.log(POLICY.unlisted_odds) * scale
     standing = np.array([t.standing for t in done.tried] + [done.threshold, other])
     if done.resolved:
@@ -108,14 +143,12 @@ def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     if best is None:
         weight /= weight.sum()
         return [], float(weight[-2]), float(weight[-1])
-    like = np.array([t.cluster == best.cluster for t in done.tried] + [False, False])
+    like = np.array([t is best or alike(best, t) for t in done.tried] + [False, False])
     own = min(done.trust, probability_cap(runs))
     weight[like] *= own / weight[like].sum()
     weight[~like] *= (1.0 - own) / max(weight[~like].sum(), 1e-300)
-    out = [
-        Explanation(t, float(p), bool(a) or p > POLICY.alike_min_probability_share * weight[0])
-        for t, p, a in zip(done.tried, weight, like, strict=False)
-    ]
+    every = zip(done.tried, weight.tolist(), like.tolist(), strict=False)
+    out = [Explanation(t, p, a) for t, p, a in every]
     return [out[0], *sorted(out[1:], key=lambda e: -e.probability)], float(weight[-2]), float(weight[-1])
 
 

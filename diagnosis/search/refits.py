@@ -11,7 +11,6 @@ import numpy as np
 
 from data.errors import InputError, WorkError
 from data.processes import Processes
-from diagnosis.candidates.discretisation import never_reported
 from diagnosis.candidates.priors import log_odds, starts
 from diagnosis.contracts import CandidateKind, Fitted, Scored, Tried
 from diagnosis.fitting.fitted import refitted, relinearised
@@ -27,8 +26,7 @@ Progress = Callable[[str, int, int], None]  # receives the step, how many of it 
 def odds_of(now: Fitted, seen: Screen) -> dict[str, float]:
     """Log odds of every candidate that may be claimed, by name."""
     every = [s.candidate for s in seen.scored]
-    never = never_reported(every, now)
-    own = [c for c in every if c.name not in never and c.kind is not CandidateKind.SENSOR_SWAP]
+    own = [c for c in every if c.kind is not CandidateKind.SENSOR_SWAP]
     variants = Counter(c.mechanism for c in own if not c.variant_of)
     cost = POLICY.unlisted_term_cost_nats
     return {c.name: log_odds(c, now, variants[c.mechanism]) - cost * c.kind.is_unlisted for c in own}

@@ -1,8 +1,8 @@
-"""The search: effects are added one at a time, each chosen by full refits, until none is probable enough."""
+"""The search: effects are added one at a time, then each is judged with all others in the model."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from threadpoolctl import threadpool_limits
@@ -11,90 +11,103 @@ from data.errors import InputError, WorkError
 from data.processes import Processes
 from diagnosis.candidates.free_forms import Form, candidate_of, free_forms
 from diagnosis.contracts import Candidate, Fitted, Tried, with_parts
-from diagnosis.fitting.fitted import left_out_rows, refitted, relearned, structured, unharmed, worsened
+from diagnosis.fitting.fitted import refitted, relearned
 from diagnosis.localisation.balance import impossible
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, proposed, screen
-from diagnosis.search.claims import Round, fall, null_quantile, trust
+from diagnosis.search.claims import Round, figures
 from diagnosis.search.refits import Progress, odds_of, refits, shortlist
 from twin.schema import TwinPart
 
 
 @dataclass(frozen=True)
 class Search:
-    """All rounds; the last one accepted nothing, or the limit was reached.
-
-    `dropped` numbers the rounds whose effect later effects made needless.
-    """
+    """The fit without effects, that with all that were claimed, and the rounds: of each effect, judged with the others
+    in the model, and the last, which found nothing that is probable enough (unless the limit was reached)."""
 
     baseline: Fitted
     final: Fitted
     rounds: tuple[Round, ...]
-    dropped: tuple[int, ...] = ()
 
     @property
     def accepted(self) -> tuple[Round, ...]:
-        return tuple(r for k, r in enumerate(self.rounds) if r.accepted and k not in self.dropped)
+        return tuple(r for r in self.rounds if r.accepted)
 
 
 def search(baseline: Fitted, workers: Processes | None = None, progress: Progress | None = None) -> Search:
-    """Forward until nothing more is accepted; then effects that later ones made needless are taken out."""
+    """Grown while the likeliest effect is not improbable; then each is judged, or replaced, with all others in the
+    model: two effects may each be hidden by the other."""
     tell, workers = progress or (lambda step, n, of: None), workers or Processes()
-    now = baseline
     rounds: list[Round] = []
-    while len(rounds) <= POLICY.max_effects:
-        done = one_round(now, workers, tell, rounds[-1].screen if rounds else None)
-        rounds.append(done)
-        if len(rounds) == 1:
-            baseline = done.before
-        if not done.accepted or done.best is None:
-            now = done.before
+    now = baseline
+    while len(rounds) < POLICY.max_effects:
+        rounds.append(one_round(now, workers, tell, rounds[-1].screen if rounds else None))
+        best = rounds[-1].best
+        if best is None or rounds[-1].trust < POLICY.grown_min_probability:
             break
-        now = _again(done.best.fitted)
-    return _without_needless(Search(baseline, now, tuple(rounds)))
+        now = best.fitted
+    first = rounds[0].before
+    rounds, final = _judged_together(first, rounds, workers, tell)
+    return Search(first, final, tuple(rounds))
 
 
-def _again(fitted: Fitted) -> Fitted:
-    """The fit with an effect more, under the covariance of refined twins that have it too: a law of the list is as
-    coarse as a body, and what it leaves is no further effect."""
-    try:
-        return replace(structured(fitted, fitted.runs), weight=fitted.weight)
-    except WorkError:
-        return fitted  # no refined twin can be simulated there: under what those of before show
+def _judged_together(
+    baseline: Fitted, rounds: list[Round], workers: Processes, tell: Progress
+) -> tuple[list[Round], Fitted]:
+    """The rounds, each with all other effects in its fit before, and the fit with those that are accepted."""
+    grown = [k for k, r in enumerate(rounds) if r.trust >= POLICY.grown_min_probability]
+    full = rounds[grown[-1]].best.fitted if grown else baseline  # type: ignore[union-attr]
+    for k in grown[:-1]:
+        try:
+            done = one_round(_less(full, rounds[k], baseline), workers, tell, rounds[k].screen)
+        except (InputError, WorkError):
+            continue  # no machine is without it
+        rounds[k] = done
+        full = done.best.fitted if done.best is not None else done.before
+    for k in grown:
+        if not rounds[k].accepted:
+            full = rounds[k].before if len(grown) == 1 else _less(full, rounds[k], baseline)
+    return rounds, full if any(r.accepted for r in rounds) else baseline
+
+
+def _less(fitted: Fitted, done: Round, baseline: Fitted) -> Fitted:
+    """The fit without the effect of a round."""
+    if done.best is None:
+        return fitted
+    return refitted(fitted, without(fitted.part, done.best.candidate, baseline.part))
 
 
 def one_round(
     now: Fitted, workers: Processes, tell: Progress, before: Screen | None = None, listed: bool = True
 ) -> Round:
-    """One effect named and accepted, or none; free forms stand in for what no list names, alone if not `listed`."""
+    """What one effect more would explain, the likeliest first; free forms stand in for what no list names, alone if not
+    `listed`."""
     tell("screen", 0, 0)
     forms = _forms(now)
-    every = [*(proposed(now) if listed else ()), *(candidate for candidate, _ in forms.values())]
-    seen = screen(now, every, before)
+    plain = [c for c, f in forms.values() if f.plain]
+    seen = screen(now, [*(proposed(now) if listed else ()), *plain], before)
+    places = list(dict.fromkeys(s.candidate.where for s in seen.scored))[: POLICY.form_places]
+    more = [c for c, f in forms.values() if not f.plain and f.where in places]
+    seen = screen(now, [*(s.candidate for s in seen.scored), *more], seen)
     odds = odds_of(now, seen)
-    null = seen.null_gains(odds)
     tried = refits(now, seen, shortlist(now, seen, odds), odds, workers, tell)
     now, tried = _fair(now, tried)
     known = {n: f for n, (_, f) in forms.items()}
-    return decided(Round(now, seen, tuple(tried), null, 0.0, False, forms=known))
+    return decided(Round(now, seen, tuple(tried), forms=known))
 
 
-def decided(done: Round, vetoed: bool = True) -> Round:
-    """A round whose claim is the first of its likeliest that may be made; else the first that was judged. `vetoed`:
-    none is made that predicts a channel worse."""
+def decided(done: Round) -> Round:
+    """A round with its likeliest explanations under the covariance that is likeliest for each, and their figures; what
+    alone makes possible what the recordings show comes first."""
     strange = frozenset(i.channel for i in impossible(done.before))
     able = [t for t in done.tried if _resolves(t, strange)]
     likely = [*able, *(t for t in done.tried if t not in able)][: max(POLICY.settled, len(able))]
     settled = [_settled(done.before, t) for t in likely]
     first = sorted(settled, key=lambda t: (not _resolves(t, strange), -t.standing))
-    done = replace(done, tried=(*first, *(t for t in done.tried if t not in likely)))
-    judged: list[Round] = []
-    may = odds_of(done.before, done.screen) if first else {}
-    for t in first[: POLICY.claims_judged]:
-        judged.append(_judged(done, t, may, strange, vetoed))
-        if judged[-1].accepted:
-            return judged[-1]
-    return judged[0] if judged else done
+    tried = (*first, *(t for t in done.tried if t not in likely))
+    if not tried:
+        return done
+    return replace(done, tried=tried, figures=figures(done.before, tried), resolved=_resolves(tried[0], strange))
 
 
 def _forms(now: Fitted) -> dict[str, tuple[Candidate, Form]]:
@@ -115,34 +128,9 @@ def _resolves(t: Tried, before: frozenset[str]) -> frozenset[str]:
     return before - {i.channel for i in impossible(t.fitted)} if before else frozenset()
 
 
-def _judged(done: Round, t: Tried, may: Collection[str], impossible_now: frozenset[str], vetoed: bool) -> Round:
-    """The round with `t` as its claim: probable enough, and no channel predicted worse.
-
-    What structure alone gains is asked of the machine with the claim: without it, what it explains is in every twin.
-    `may`: names of the candidates that may be claimed.
-    """
-    rest = [o for o in done.tried if o is not t]
-    seen = screen(t.fitted, [s.candidate for s in done.screen.scored], done.screen)
-    done = replace(done, null=seen.null_gains(may))
-    fallen = fall(done.before, t.fitted)
-    resolved = _resolves(t, impossible_now)
-    probable = POLICY.max_probability if resolved else trust(fallen)
-    enough = probable >= POLICY.claim_min_probability and (bool(resolved) or t.gain > done.threshold)
-    raised: Mapping[str, tuple[float, float]] = {}
-    if enough and vetoed:
-        fitted, raised = unharmed(done.before, t.fitted)
-        t = replace(t, fitted=fitted)
-        if resolved:  # what makes it possible must also show it
-            enough = bool(worsened(left_out_rows(fitted), left_out_rows(done.before)))
-    return replace(
-        done, tried=(t, *rest), trust=probable, accepted=enough and not raised, fall=fallen, raised=raised,
-        resolved=resolved,
-    )  # fmt: skip
-
-
 def _fair(now: Fitted, tried: list[Tried]) -> tuple[Fitted, list[Tried]]:
     """The fit before as good as the best refit is without its candidate, so that no gain is due to a better start."""
-    for t in tried[: POLICY.claims_judged]:
+    for t in tried[: POLICY.settled]:
         try:
             back = refitted(t.fitted, now.part)
         except (InputError, WorkError):
@@ -153,27 +141,6 @@ def _fair(now: Fitted, tried: list[Tried]) -> tuple[Fitted, list[Tried]]:
             tried = [replace(o, gain=o.gain - more, by_run=o.by_run - lost) for o in tried]
             now = back
     return now, sorted(tried, key=lambda t: -t.standing)
-
-
-def _without_needless(done: Search) -> Search:
-    """Effects taken out, one at a time, whose loss of evidence is no more than structure gains."""
-    for _ in range(POLICY.max_effects):
-        rounds = [(k, r) for k, r in enumerate(done.rounds) if r.accepted and k not in done.dropped]
-        if len(rounds) < 2:
-            return done
-        for k, r in rounds[:-1]:
-            assert r.best is not None
-            try:
-                rest = refitted(done.final, without(done.final.part, r.best.candidate, done.baseline.part))
-            except (InputError, WorkError):
-                continue
-            loss = done.final.log_evidence - rest.log_evidence
-            if loss < null_quantile(r.null) and not worsened(left_out_rows(done.final), left_out_rows(rest)):
-                done = replace(done, final=rest, dropped=(*done.dropped, k))
-                break
-        else:
-            return done
-    return done
 
 
 def without(part: TwinPart, c: Candidate, original: TwinPart) -> TwinPart:

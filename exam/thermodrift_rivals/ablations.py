@@ -78,11 +78,6 @@ def independent_noise(stage: Stage) -> Reply:
     return stage.reply(one_round(bare, Processes(), lambda step, n, of: None))
 
 
-def no_veto(stage: Stage) -> Reply:
-    """A claim is made although it predicts a channel worse."""
-    return stage.reply(decided(stage.round, vetoed=False))
-
-
 def no_floor_check(stage: Stage) -> Reply:
     """The residual is not judged: a claim explains everything, and no claim means that nothing is missing."""
     return stage.reply(stage.round, replace(POLICY, checks_residual=False))

@@ -27,7 +27,6 @@ ABLATIONS = Registry(
         "reference": "thermodrift_rivals.ablations:reference",
         "no_projection": "thermodrift_rivals.ablations:no_projection",
         "independent_noise": "thermodrift_rivals.ablations:independent_noise",
-        "no_veto": "thermodrift_rivals.ablations:no_veto",
         "no_floor_check": "thermodrift_rivals.ablations:no_floor_check",
     },
 )

@@ -289,43 +289,6 @@ def autocorrelation(acf: pd.DataFrame, changed: bool, simulated: bool, most: int
     return fig
 
 
-def null_gains(null: pd.DataFrame, steps: pd.DataFrame, simulated: bool) -> Figure:
-    """Best gains when nothing is missing (refined twins), the threshold, and the gain of every step that was tried."""
-    gains = null["gain"].to_numpy(float)
-    high = 2.2
-    fig = Figure(figsize=(WIDTH_IN, high))
-    ax = fig.add_axes((0.05, 0.45 / high, 0.945, 1.3 / high))
-    calm(ax)
-    least = max(float(np.nanmin(np.r_[gains[gains > 0], steps["gain"][steps["gain"] > 0], 1.0])), 0.1)
-    most = float(np.nanmax(np.r_[gains, steps["gain"], steps["threshold"], 10 * least]))
-    edges = np.geomspace(0.9 * least, 1.35 * most, 49)
-    counts = np.histogram(np.clip(gains, edges[0], edges[-1]), edges)[0]
-    ax.bar(edges[:-1], counts, np.diff(edges), align="edge", color="#b9c3cd", edgecolor="white", lw=0.6)
-    top = 1.15 * max(float(counts.max()), 1.0)
-    for k, r in enumerate(steps.to_dict("records")):
-        color = BLUE if r["accepted"] else MUTED
-        at = float(np.clip(r["gain"], edges[0], edges[-1]))
-        ax.plot([at, at], [0, 0.72 * top], color=color, lw=2.0)
-        side = "right" if at > np.sqrt(edges[0] * edges[-1]) else "left"
-        beyond = f" ({number(float(r['gain']), 0)} nats, left of the axis)" if r["gain"] < edges[0] else ""
-        label = f"step {r['step']}, {'accepted' if r['accepted'] else 'rejected'}{beyond}"
-        ax.annotate(label, (at, (0.62 - 0.16 * (k % 3)) * top), (-5 if side == "right" else 5, 0), color=color,
-                    textcoords="offset points", ha=side, va="center", fontsize=8.5,
-                    path_effects=[withStroke(linewidth=3, foreground="white")])  # fmt: skip
-    if len(steps):
-        bound = float(steps["threshold"].iloc[0])
-        ax.axvline(bound, color=INK, lw=1.2, ls=(0, (4, 2)))
-        ax.annotate(f"threshold {number(bound, 0 if bound >= 9.5 else 1)}", (bound, 0.96 * top), (5, 0), color=INK,
-                    textcoords="offset points", ha="left", va="center", fontsize=8.5)  # fmt: skip
-    ax.set(xscale="log", xlim=(edges[0], edges[-1]), ylim=(0, top))
-    ax.xaxis.set_major_formatter(lambda v, _: f"{v:g}")
-    ax.set_xlabel("gain in left-out log score, nats", fontsize=8, labelpad=1)
-    ax.set_ylabel("twins", fontsize=8)
-    ax.locator_params(axis="y", nbins=3)
-    head(fig, f"Gains that structure alone gives: {len(gains)} refined twins with nothing missing", simulated)
-    return fig
-
-
 def missing_flux(flux: pd.DataFrame, simulated: bool, most: int = 6) -> Figure:
     """What would have to arrive at a place so that the simulation meets the recording, with its 90 % band."""
     pairs = list(dict.fromkeys(zip(flux["kind"], flux["place"], flux["batch"], strict=True)))[:most]

@@ -152,8 +152,6 @@ def _evidence(d: Diagnosis, pictures: bool) -> Section | None:
                 into.append(_drawn(evidence.where_when(t["map"], groups, sim), f"Mismatch {grouped}", d))
     if pictures and len(t["acf"]):
         shown.append(_drawn(evidence.autocorrelation(t["acf"], changed, sim), "Residual autocorrelation", d))
-    if pictures and len(t["null"]):
-        shown.append(_drawn(evidence.null_gains(t["null"], t["steps"], sim), "Gains with nothing missing", d))
     found = {(x.mechanism, x.where.name): x.probability for x in d.findings.findings}
     shown += [tables.candidates(t["candidates"], sim, found)] if len(t["candidates"]) else []
     shown += [tables.steps(t["steps"], sim)] if len(t["steps"]) else []

@@ -52,10 +52,8 @@ GLOSSARY = (
      "Displacements count from their first sample."),
     ("before, after", "The recalibrated simulation without and with what was found."),
     ("noise floor", "The rms that noise alone leaves to any simulation."),
-    ("gain", "Rise of the log score (log likelihood) of the left-out runs, in nats; the threshold is what structure "
-     "alone reaches when nothing is missing."),
-    ("misfit removed", "By how much less the twin leaves with an effect: rms over noise, geometric mean over channels. "
-     "It makes the probability of a claim."),
+    ("gain", "Rise of the log score (log likelihood) of the left-out runs, in nats; from the threshold on an "
+     "effect that nothing else resembles is claimed."),
     ("absorbed", "Share of an effect's signature that recalibrating the other parameters imitates. Near 100 %, only "
      "its prior keeps it apart."),
     ("unexplained heat, displacement, reading", "What a smooth free input at that place would have to be to close the "
@@ -249,11 +247,11 @@ def steps(table: pd.DataFrame, simulated: bool) -> Table:
     for r in table.to_dict("records"):
         gain, threshold = _nats(r["gain"], sign=True), _nats(r["threshold"])
         verdict = "accepted" if r["accepted"] else "rejected"
-        removed, better = f"{100 * r['removed']:.0f} %", f"{int(r['improved'])}"
-        rows.append(Row.of(f"{r['step']}", str(r["words"]), gain, threshold, removed, better, verdict))
+        sure, better = f"{100 * r['probability']:.0f} %", f"{int(r['improved'])}"
+        rows.append(Row.of(f"{r['step']}", str(r["words"]), gain, threshold, sure, better, verdict))
     columns = (
         Column("step"), Column("tried", kind="wide"), Column("gain", "nats", "number"),
-        Column("threshold", "nats", "number"), Column("misfit removed", kind="number"),
+        Column("threshold", "nats", "number"), Column("probability", kind="number"),
         Column("runs better", kind="number"), Column("verdict"),
     )  # fmt: skip
     return Table("Steps of the search", columns, tuple(rows), simulated)

@@ -203,15 +203,15 @@ def likelier(problem: Problem, one: State, other: State) -> State:
     Rows that count as one are those of the state whose residuals are less correlated, for both: each state's own would
     reward the smoother misfit.
     """
-    noises = [noise_left(problem, s) for s in (one, other)]
-    every_row = np.bincount(np.concatenate(one.channels), minlength=len(problem.channels))
-    rows = every_row / np.minimum(noises[0].inflation, noises[1].inflation)
+    inflation = np.minimum(*(noise_left(problem, s).inflation for s in (one, other)))
+    return one if log_posterior(problem, one, inflation) >= log_posterior(problem, other, inflation) else other
 
-    def cost(state: State, noise: Noise) -> float:
-        priors = float(state.z @ state.z) + sum(float(v @ v) for v in state.nuisance)
-        return priors + float(np.sum(rows * np.log(noise.factor**2)))
 
-    return one if cost(one, noises[0]) <= cost(other, noises[1]) else other
+def log_posterior(problem: Problem, state: State, inflation: Array) -> float:
+    """Nats, up to a constant, when every channel's noise is unknown; `inflation` (c,) rows of a channel count as one."""
+    rows = np.bincount(np.concatenate(state.channels), minlength=len(problem.channels)) / inflation
+    priors = float(state.z @ state.z) + sum(float(v @ v) for v in state.nuisance)
+    return -0.5 * (priors + float(np.sum(rows * np.log(noise_left(problem, state).factor ** 2))))
 
 
 SAME_COST = 1e-3  # starts whose costs differ by less, and which lie together, have reached the same optimum

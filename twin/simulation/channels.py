@@ -100,9 +100,9 @@ class Rows:
 
     @cached_property
     def _drivers(self) -> dict[str, Numeric]:
-        """By channel in the interval that begins at each row (`intervals_at_rows`)."""
+        """By channel what each row shows, or else what holds in the interval behind it (`intervals_at_rows`)."""
         at = intervals_at_rows(self.inputs.time_s.shape[1] - 1, self.inputs.every)
-        return {channel: series[:, at] for channel, series in self.inputs.drivers.items()}
+        return {channel: series[:, at] for channel, series in self.inputs.drivers.items()} | dict(self.inputs.at_rows)
 
     @cached_property
     def _air(self) -> list[Numeric]:

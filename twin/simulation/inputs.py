@@ -155,7 +155,8 @@ class Inputs:
     in each interval; recorded surroundings by channel (B, M + 1) at the borders, linear between (a plan may also give
     one by the surrounding's own name); clock_h (B,) time of day at the start, nan if unknown; first: by channel the
     first readings (B,), nan where there is none; every: how many intervals lie between two rows of the recording, so
-    that borders ``::every`` are its rows; times: by heat law what its watts are multiplied by in each batch (B,);
+    that borders ``::every`` are its rows; at_rows: by driver what the K rows show (B, K), where that is not what holds in the
+    interval behind them; times: by heat law what its watts are multiplied by in each batch (B,);
     offsets_K (P or 1, B, S): what is added to the surroundings of each batch, per parameter set.
     """
 
@@ -167,6 +168,7 @@ class Inputs:
     clock_h: Array
     first: Mapping[str, Array]
     every: int = 1
+    at_rows: Mapping[str, Array] = field(default_factory=dict)
     times: Mapping[str, Array] = field(default_factory=dict)
     offsets_K: Array | None = None
     kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # worked out once
@@ -225,6 +227,7 @@ class Inputs:
             recorded={n: v[at] for n, v in self.recorded.items()},
             clock_h=self.clock_h[at],
             first={n: v[at] for n, v in self.first.items()},
+            at_rows={n: v[at] for n, v in self.at_rows.items()},
             times={n: v[at] for n, v in self.times.items()},
             offsets_K=None if self.offsets_K is None else self.offsets_K[:, at],
         )
@@ -244,7 +247,8 @@ def inputs_of(network: Network, batches: Sequence[Batch], substeps: int = 1, max
     surroundings = [s.channel for s in network.surroundings if s.channel]
     for batch in batches:
         _check_channels(network, batch, [*network.drivers, *surroundings])
-    drivers = {n: [_filled(b, n, max_gap_s, hold=True)[:-1] for b in batches] for n in network.drivers}
+    shown = {n: [_filled(b, n, max_gap_s, hold=True) for b in batches] for n in network.drivers}
+    drivers = {n: [_held(b, n, v)[:-1] for b, v in zip(batches, own, strict=True)] for n, own in shown.items()}
     recorded = {n: [_filled(b, n, max_gap_s, hold=False) for b in batches] for n in dict.fromkeys(surroundings)}
     starts = [*(r.channel for r in network.readings), *(c for s in network.surroundings for c in s.first)]
     first = {n: np.array([_first(b, n, max_gap_s) for b in batches]) for n in dict.fromkeys(starts)}
@@ -261,8 +265,29 @@ def inputs_of(network: Network, batches: Sequence[Batch], substeps: int = 1, max
         recorded={n: _padded(v, longest + 1) for n, v in recorded.items()},
         clock_h=np.array([_clock_h(b) for b in batches]),
         first=first,
+        at_rows={n: _padded(v, longest + 1) for n, v in shown.items() if any(n in b.held for b in batches)},
     )
     return inputs.refined(substeps)
+
+
+def acting(batches: Sequence[Batch], lead_rows: float) -> list[Batch]:
+    """The batches whose drivers act so many rows (0 to 1) before the row that first shows a change.
+
+    Between two rows the mean of what holds in either part of the interval acts.
+    """
+    return [replace(b, held={n: _ahead(b.masked(n), lead_rows) for n in b.names("driver") if n in b.table.columns})
+            if lead_rows else b for b in batches]  # fmt: skip
+
+
+def _ahead(values: Array, lead_rows: float) -> Array:
+    after = np.append(values[1:], values[-1:])
+    return np.where(np.isfinite(values) & np.isfinite(after), (1.0 - lead_rows) * values + lead_rows * after, values)
+
+
+def _held(batch: Batch, channel: str, shown: Array) -> Array:
+    """What holds from each row to the next (n,); where that is not known, what the row shows."""
+    held = batch.held.get(channel, shown)
+    return np.where(np.isfinite(held), held, shown)
 
 
 def inputs_of_plan(network: Network, plan: RunPlan, clock_h: float = math.nan) -> Inputs:

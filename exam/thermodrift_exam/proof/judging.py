@@ -152,9 +152,9 @@ def truth_from_json(plain: Mapping[str, Any] | None) -> TrueModel | None:
         return math.nan if value is None else value
 
     before, true, floor = (number(plain[k]) for k in ("error_before", "error_true", "error_floor"))
-    gains, thresholds, bars = (tuple(map(number, plain[k])) for k in ("gain_nats", "threshold_nats", "bar_nats"))
+    gains, bars = (tuple(map(number, plain[k])) for k in ("gain_nats", "bar_nats"))
     sizes = tuple((value, low, high) for value, low, high in plain["sizes"])
-    return TrueModel(before, true, floor, gains, thresholds, bars, tuple(plain["visible"]), sizes)
+    return TrueModel(before, true, floor, gains, bars, tuple(plain["visible"]), sizes)
 
 
 def scoring_source() -> str:

@@ -1,7 +1,7 @@
 """The true model, the twin with the concealed terms, refitted: errors of a perfect answer, and visibility of each term.
 
-A term is visible when, with the others in, it gains `VISIBLE_NATS` of log evidence and more than structure alone does
-in one of a hundred refined twins. Of a term that no candidate describes it is unknown.
+A term is visible when, with the others in, it gains `VISIBLE_NATS` of log evidence, each fit under its own likeliest
+hyperparameters. Of a term that no candidate describes it is unknown.
 """
 
 from __future__ import annotations
@@ -27,8 +27,6 @@ from diagnosis.fitting.batches import enough_batches, usable_batches
 from diagnosis.fitting.fitted import baseline, left_out_rows, refitted, relearned
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, proposed, screen
-from diagnosis.search.claims import null_quantile
-from diagnosis.search.refits import odds_of
 from evidence.scoring.answer_key import AnswerKey, Spot, TrueTerm
 from evidence.scoring.matching import Sized, counted_as, exact, sized
 from twin.calibration.identifiability import Interval, intervals90
@@ -143,8 +141,7 @@ VISIBLE_NATS = 30.0  # odds of 1e13
 @dataclass(frozen=True)
 class TrueModel:
     """Errors in units of the noise (`error_level`) of the baseline, the true model and noise alone; one entry a term of
-    `gain_nats`, `threshold_nats`, what structure alone gains, and `bar_nats`, what visible takes; nan where nothing
-    could be fitted. `sizes`: a term's amplitude as the true model fits it, low and high of its 90 % interval as a
+    `gain_nats` and `bar_nats`, what visible takes; nan where nothing could be fitted. `sizes`: a term's amplitude as the true model fits it, low and high of its 90 % interval as a
     diagnosis states them (`amplitude.sized`).
 
     `visible` None: unknown, since no candidate describes the term.
@@ -154,7 +151,6 @@ class TrueModel:
     error_true: float
     error_floor: float
     gain_nats: tuple[float, ...]
-    threshold_nats: tuple[float, ...]
     bar_nats: tuple[float, ...]
     visible: tuple[bool | None, ...]
     sizes: tuple[Sized, ...]
@@ -171,13 +167,12 @@ def true_model(machine: Machine, batches: Sequence[Batch], answer: Mapping[str, 
     fit = _fit(machine, batches)
     level = _level(fit)
     if not key.terms:
-        return TrueModel(level, level, 1.0, (), (), (), (), ())
+        return TrueModel(level, level, 1.0, (), (), (), ())
     every = [*proposed(fit), *(c for t in key.terms if (c := of_no_list(t, fit)) is not None)]
     seen = screen(fit, every)
-    threshold = null_quantile(seen.null_gains(odds_of(fit, seen)))
     found, full = best_candidates(fit, key.terms, [true_candidates(t, seen, every) for t in key.terms])
-    judged = [_judged(fit, full, key.terms, found, k, threshold) for k in range(len(key.terms))]
-    numbers = zip(*((j.gain, threshold, max(threshold, VISIBLE_NATS), j.visible, j.size) for j in judged), strict=True)
+    judged = [_judged(fit, full, key.terms, found, k) for k in range(len(key.terms))]
+    numbers = zip(*((j.gain, VISIBLE_NATS, j.visible, j.size) for j in judged), strict=True)
     return TrueModel(level, _level(full or fit), 1.0, *numbers)
 
 
@@ -234,8 +229,7 @@ def _with(fit: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None]
 
 
 def _judged(
-    fit: Fitted, full: Fitted | None, terms: Sequence[TrueTerm], found: Sequence[Scored | None], which: int,
-    threshold: float,
+    fit: Fitted, full: Fitted | None, terms: Sequence[TrueTerm], found: Sequence[Scored | None], which: int
 ) -> _Judged:  # fmt: skip
     """One term with the others in the model, compared with the better of two fits without it."""
     s = found[which]
@@ -248,7 +242,7 @@ def _judged(
     except (InputError, WorkError):
         return _Judged()
     gain = full.log_evidence - max(without)
-    return _Judged(gain, gain > max(threshold, VISIBLE_NATS), _size(full, s, terms[which]))
+    return _Judged(gain, gain > VISIBLE_NATS, _size(full, s, terms[which]))
 
 
 @lru_cache(maxsize=1)

@@ -26,9 +26,7 @@ from data.batch import Batch
 from data.files import write_atomic
 from diagnosis.contracts import Fitted
 from diagnosis.fitting.fitted import baseline
-from diagnosis.screening.screen import proposed, screen
-from diagnosis.search.claims import null_quantile
-from diagnosis.search.refits import odds_of
+from diagnosis.search.claims import PLAIN
 from thermodrift_exam.plants.effects import EFFECTS
 from thermodrift_exam.plants.options import stream
 from thermodrift_exam.plants.plant import draw, posed
@@ -38,8 +36,8 @@ from thermodrift_exam.proof.suite.sizes import ALL_OR_NOTHING, most
 from twin.schema import twin_part
 
 HOW = (
-    "Size at which an effect's own signature, with recalibration and structure integrated out, is expected to gain the "
-    "99 % quantile of what structure alone does; median over development plants that lack nothing else."
+    "Size at which an effect's own signature, with recalibration and structure integrated out, is expected to gain what "
+    "a claim takes that nothing else resembles; median over development plants that lack nothing else."
 )
 MOST = 40.0  # the largest size
 SELDOM = ("mandrel",)  # most machines are measured without one
@@ -66,8 +64,7 @@ class Bench:
         options = {**setting(seed, "development"), **EVEN, "has": list(stated), "lacks": lacks, "solver_s": STEP_S}
         case = draw(seed, plant=plant, **options)
         fitted = baseline(case.machine, twin_part(case.machine), case.batches, None, len(case.batches))
-        seen = screen(fitted, proposed(fitted))
-        return cls(seed, plant, options, fitted, null_quantile(seen.null_gains(odds_of(fitted, seen))))
+        return cls(seed, plant, options, fitted, PLAIN.least_relative_gain * abs(fitted.log_evidence))
 
     def clean(self, sizes: Mapping[str, float]) -> list[Batch]:
         """The same runs without noise, with effects of these sizes."""
@@ -102,7 +99,7 @@ class Bench:
         """The multiple of these rows at the limit; `MOST` where more is needed."""
         now, p = self.fitted, len(self.fitted.z)
         white = now.marginal.white([r[:, None] for r in rows])
-        c = now.marginal.reduced(
+        c = now.level.reduced(
             now.marginal.grams([np.hstack([x[:, :-1], w]) for x, w in zip(now.columns, white, strict=True)])
         )
         taken = c[:p, p] @ np.linalg.solve(c[:p, :p] + np.eye(p), c[:p, p])

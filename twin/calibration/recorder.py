@@ -1,0 +1,49 @@
+"""When drivers changed within a row: learned from the recordings where the machine file does not state it.
+
+A recorder that reads a speed at an instant shows a change up to a row late; one that writes means shows it a row late.
+A twin that holds every driver from its row on is late by as much, which looks like a skew of clocks or a sensor's lag.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from data.machine import LEAD_ROWS, Machine
+from twin.calibration.fit_problem import Noise
+from twin.calibration.least_squares import FitOptions, State, log_posterior, noise_left, settled
+from twin.calibration.problem import CalibrationProblem
+
+
+def settled_with_lead(
+    machine: Machine,
+    problem_at: Callable[[float], CalibrationProblem],
+    options: FitOptions,
+    noise: Noise | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[float, CalibrationProblem, State, str]:
+    """`settled` for the problem whose drivers lead by as many rows as is likeliest, or as the machine file states.
+
+    Compared are the posteriors at each optimum with the noise of every channel unknown; rows count alike.
+
+    Args:
+        problem_at: the problem whose drivers' changes come so many rows (0 to 1) before the row that shows them.
+
+    Returns:
+        The lead in rows, its problem, and what `settled` returns for it.
+    """
+    stated = machine.recording.drivers
+    held = problem_at(LEAD_ROWS[stated or "held"])
+    state, notes = settled(held, options, progress, noise)
+    best = LEAD_ROWS[stated or "held"], held, state, notes
+    if stated or not held.network.drivers or not any(np.ptp(v) for v in held.inputs.drivers.values()):
+        return best
+    inflation = noise_left(held, state).inflation
+    most = log_posterior(held, state, inflation)
+    for lead_rows in sorted(LEAD_ROWS.values())[1:]:
+        problem = problem_at(lead_rows)
+        state, notes = settled(problem, options, progress, noise)
+        if (level := log_posterior(problem, state, inflation)) > most:
+            best, most = (lead_rows, problem, state, notes), level
+    return best
