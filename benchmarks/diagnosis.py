@@ -91,7 +91,7 @@ def steps_of(p: Posed, repeats: int, which: tuple[str, ...] = STEPS) -> Iterator
     yield "linearise", timed(linearised, repeats)[0]
     if "assemble" in which:
         yield "assemble", timed(lambda: State.at(problem, state.z, state.nuisance, state.noise), repeats)[0]
-    yield "score a fit", timed(lambda: fitted.marginal.log_evidence(fitted.marginal.grams(fitted.columns)), repeats)[0]
+    yield "score a fit", timed(lambda: fitted.level.log_evidence(fitted.marginal.grams(fitted.columns)), repeats)[0]
     if "candidates" in which:
         yield "candidates", timed(lambda: proposed(fitted), repeats)[0]
     took, seen = timed(lambda: screen(fitted, p.every), repeats)

@@ -4,14 +4,14 @@
     python -m benchmarks.kinds --paired 870000 --table results/diagnosis_kinds.csv
     python -m benchmarks.kinds --paired 700000 --claims results/claims.csv
 
-Draws cases of the proof for every kind (nothing missing, one effect or two, an effect of no list), diagnoses each, and
-prints by kind: effects named (of those that are visible at all, and of all), claims and how many of them are true, false
+Draws cases of the proof for every kind (nothing missing, one effect or two, one of no list), diagnoses each, and prints
+by kind: effects named (of those that are visible at all, and of all), claims and how many of them are true, false
 alarms, cases of two effects with both named, unlisted effects flagged, and seconds of CPU. An effect is named where a
 finding, or an explanation that these recordings cannot distinguish from it, has its mechanism and its place. Cases that
 are done are not done again; `--workers` side by side. `--paired` takes of every kind eleven cases with one effect of at
 least `--noises` times its noise, seven with none and three with two, by seeds from the number given; `--table` stores a
-row for each, `--claims` one for each round, to which `POLICY.claim_weights` is fitted; what is visible is not judged for
-it. The proof (`thermodrift prove --plants …`) asks the same under seal, with baselines.
+row for each, `--claims` one for each round, to which `POLICY.claim_weights` is fitted; what is visible is not judged
+for it. The proof (`thermodrift prove --plants …`) asks the same under seal, with baselines.
 """
 
 from __future__ import annotations
@@ -100,14 +100,12 @@ def _answered(done: Diagnosis, key: AnswerKey, part: TwinPart) -> dict[str, Any]
     bodies = {name: sensor.at.partition("@")[0] for name, sensor in part.sensors.items()}
     listed = []
     for f in found.findings:
-        alike = [f, *(a for a in f.alternatives if a.alike)]
-        of = [
-            k for k, term in enumerate(key.terms)
-            if any(names_term(a.mechanism, Spot(a.where.kind, a.where.name), term, bodies) for a in alike)
-        ]  # fmt: skip
+        same = [(a.mechanism, a.where) for a in f.alternatives if a.alike]
+        every = [(m, Spot(where.kind, where.name)) for m, where in [(f.mechanism, f.where), *same]]
+        of = [k for k, term in enumerate(key.terms) if any(names_term(m, at, term, bodies) for m, at in every)]
         listed.append({
             "name": f"{f.mechanism} {f.where.name}", "gain": f.evidence.get("gain_nats", 0.0), "of": of,
-            "alike": len(alike), "probability": f.probability,
+            "alike": len(every), "probability": f.probability,
         })  # fmt: skip
     right = bool(listed) and bool(listed[0]["of"])
     rounds = [_round(r, key, bodies) for r in done.search.rounds] if done.search is not None else []
@@ -186,8 +184,8 @@ def after_proposed(rows: Sequence[Mapping[str, Any]], runs: int) -> list[str]:
 def table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """One line a kind, and one for all."""
     out = [
-        "kind        n none/one/two/unl   named of visible   named of one   true of claims   false alarms   both of two"
-        "   unlisted   CPU s"
+        "kind        n none/one/two/unl   named of visible   named of one   true of claims   false alarms   "
+        "both of two   unlisted   CPU s"
     ]
     for kind in [*sorted({r["kind"] for r in rows}), "all"]:
         own = [r for r in rows if kind in ("all", r["kind"]) and "verdict" in r]
@@ -197,7 +195,8 @@ def table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         seen = [r for r in one if any(r.get("visible", ()))]
         made = [f for r in (*none, *one, *two) for f in r["listed"]]
         cells = [
-            f"{sum(_named(r) for r in seen):>4} of {len(seen):<4}", f"{sum(_named(r) for r in one):>4} of {len(one):<4}",
+            f"{sum(_named(r) for r in seen):>4} of {len(seen):<4}",
+            f"{sum(_named(r) for r in one):>4} of {len(one):<4}",
             f"{sum(bool(f['of']) for f in made):>4} of {len(made):<4}",
             f"{sum(bool(r['listed']) for r in none):>4} of {len(none):<4}",
             f"{sum(_named(r) == 2 for r in two):>4} of {len(two):<4}",

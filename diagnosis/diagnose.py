@@ -55,7 +55,6 @@ from diagnosis.next_experiment.proposal import NOTHING, Proposal, revealing_run,
 from diagnosis.policy import POLICY
 from diagnosis.result import Diagnosis
 from diagnosis.screening.screen import limits
-from diagnosis.search.claims import Round
 from diagnosis.search.refits import Progress
 from diagnosis.search.search import Search, search, start_worker
 from twin.calibration.identifiability import Interval, intervals90

@@ -38,8 +38,6 @@ class Policy:
     first_steps: int = cost(40, "steps", "bounds the descent from the values of the machine file")
     baseline_steps: int = cost(12, "steps", "under each covariance")
     own_rounds: int = cost(2, "rounds", "of the fit's values and the runs' own unknowns in turn")
-    weight_rounds: int = cost(3, "rounds", "of more weight for channels that would be predicted worse")
-    weight_factor: float = convention(4.0, "factor", "of such a channel's weight in each of them")
     plain_steps: int = cost(20, "steps", "of a fit that is to simulate alone; most end after ten")
 
     # Refined twins and their covariance
@@ -76,8 +74,10 @@ class Policy:
     )
     imperfection_scales: tuple[float, ...] = analytic((0.0, 0.25, 0.5, 1.0), "of their sd", "grid of the likelihood")
     value_scales: tuple[float, ...] = analytic((1.0, 2.0, 4.0), "of the file's spreads", "grid of the likelihood")
-    start_scales: tuple[float, ...] = analytic((0.1, 0.3, 1.0), "of the file's initial spread", "grid of the likelihood")
-    first_hyper: tuple[float, ...] = convention((0.5, 0.25, 1.0, 1.0), "of each", "where the climb to the likeliest sizes begins")
+    start_scales: tuple[float, ...] = analytic((0.1, 0.3, 1.0), "of the file's spread", "grid of the likelihood")
+    first_hyper: tuple[float, ...] = convention(
+        (0.5, 0.25, 1.0, 1.0), "of each", "where the climb to the likeliest sizes begins"
+    )
     hyper_rounds: int = cost(2, "rounds", "of sizes and values in turn")
     noise_min_rows: int = analytic(10, "rows", "fewer second differences show no noise")
     noise_kept_share: float = analytic(0.95, "of the rows", "the rest are jumps of a driver")

@@ -55,7 +55,7 @@ def _thinned(batch: Batch, stride: int) -> Batch:
         return batch
     group = np.arange(batch.n_rows) // stride
     held = {
-        n: pd.Series(batch.held.get(n, batch.masked(n))).groupby(group).mean().to_numpy()
+        n: np.asarray(pd.Series(batch.held.get(n, batch.masked(n))).groupby(group).mean(), np.float64)
         for n in batch.names("driver") if n in batch.table.columns
     }  # fmt: skip
     return replace(batch, table=batch.table.iloc[::stride].reset_index(drop=True), held=held)

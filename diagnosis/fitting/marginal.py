@@ -155,9 +155,7 @@ class Level:
             for n, s in zip(of.own_own, self.own_size, strict=True)
         ]
         self._taken = [self.beyond(b, d) * size for b, d in enumerate(of.own_along)]
-        information = [
-            d * size * size[:, None] - t.T @ t for d, t in zip(of.along_along, self._taken, strict=True)
-        ]
+        information = [d * size * size[:, None] - t.T @ t for d, t in zip(of.along_along, self._taken, strict=True)]
         self.information = np.stack(information)  # (B, K, K)
         self._volume = np.array([2.0 * float(np.log(np.diag(r)).sum()) for r in self._root]) + covariance.log_det
 
@@ -199,8 +197,8 @@ class Level:
         return np.asarray(inner - cross.T @ cho_solve(factor, cross))
 
     def log_evidence(self, grams: Grams) -> float:
-        """Log marginal likelihood, up to a constant, of columns [model (p), target]: parameters of prior N(0, `values`²)
-        integrated out."""
+        """Log marginal likelihood, up to a constant, of columns [model (p), target]: parameters of prior
+        N(0, `values`²) integrated out."""
         return self._log_evidence(self.products(grams))
 
     def _log_evidence(self, products: tuple[Array, Array], without: int | None = None) -> float:
@@ -208,8 +206,8 @@ class Level:
         root = np.linalg.cholesky(c[:-1, :-1] + self.prior * np.eye(len(c) - 1))
         fitted = solve_triangular(root, c[:-1, -1], lower=True)
         factor = self.factor if without is None else self.folds[without]
-        logs = 2.0 * float(np.log(np.diag(root)).sum() + np.log(np.diag(factor[0])).sum()) + float(self._volume.sum())
-        logs -= (len(c) - 1) * np.log(self.prior)
+        logs = 2.0 * float(np.log(np.diag(root)).sum() + np.log(np.diag(factor[0])).sum())
+        logs += float(self._volume.sum()) - (len(c) - 1) * np.log(self.prior)
         if without is not None:
             logs -= float(self._volume[without])
         return -0.5 * (float(c[-1, -1] - fitted @ fitted) + logs)

@@ -1,9 +1,9 @@
 """How probable a claim is: a logistic model of figures that are free of scale.
 
-What a wrong claim gains in nats grows with the recordings and with what a network cannot represent. So a claim is judged
-by what it gains relative to the log evidence of the fit before it, by the odds of its mechanism, by its lead over the
-best explanation that differs in place and mechanism, and by the share of runs that it predicts better. The weights are
-fitted to development cases of several kinds of machine (`results/claims.csv`).
+What a wrong claim gains in nats grows with the recordings and with what a network cannot represent. So a claim is
+judged by what it gains relative to the log evidence of the fit before it, by the odds of its mechanism, by its lead
+over the best explanation that differs in place and mechanism, and by the share of runs that it predicts better. The
+weights are fitted to development cases of several kinds of machine (`results/claims.csv`).
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from diagnosis.screening.screen import Screen
 class Figures:
     """What a claim is judged by; none has a unit.
 
-    `relative_gain`: nats gained over the absolute log evidence of the fit before. `log_odds` of the mechanism before the
-    recordings. `lead`: share of the gain that the best different explanation lacks. `agreeing`: share of the runs.
+    `relative_gain`: nats gained over the absolute log evidence of the fit before. `log_odds` of the mechanism before
+    the recordings. `lead`: share of the gain that the best different explanation lacks. `agreeing`: share of the runs.
     """
 
     relative_gain: float

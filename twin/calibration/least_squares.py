@@ -208,7 +208,7 @@ def likelier(problem: Problem, one: State, other: State) -> State:
 
 
 def log_posterior(problem: Problem, state: State, inflation: Array) -> float:
-    """Nats, up to a constant, when every channel's noise is unknown; `inflation` (c,) rows of a channel count as one."""
+    """Nats, up to a constant, when every channel's noise is unknown; so many rows (c,) of a channel count as one."""
     rows = np.bincount(np.concatenate(state.channels), minlength=len(problem.channels)) / inflation
     priors = float(state.z @ state.z) + sum(float(v @ v) for v in state.nuisance)
     return -0.5 * (priors + float(np.sum(rows * np.log(noise_left(problem, state).factor ** 2))))

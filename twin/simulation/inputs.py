@@ -155,8 +155,8 @@ class Inputs:
     in each interval; recorded surroundings by channel (B, M + 1) at the borders, linear between (a plan may also give
     one by the surrounding's own name); clock_h (B,) time of day at the start, nan if unknown; first: by channel the
     first readings (B,), nan where there is none; every: how many intervals lie between two rows of the recording, so
-    that borders ``::every`` are its rows; at_rows: by driver what the K rows show (B, K), where that is not what holds in the
-    interval behind them; times: by heat law what its watts are multiplied by in each batch (B,);
+    that borders ``::every`` are its rows; at_rows: by driver what the K rows show (B, K), where that is not what holds
+    in the interval behind them; times: by heat law what its watts are multiplied by in each batch (B,);
     offsets_K (P or 1, B, S): what is added to the surroundings of each batch, per parameter set.
     """
 

@@ -141,8 +141,8 @@ VISIBLE_NATS = 30.0  # odds of 1e13
 @dataclass(frozen=True)
 class TrueModel:
     """Errors in units of the noise (`error_level`) of the baseline, the true model and noise alone; one entry a term of
-    `gain_nats` and `bar_nats`, what visible takes; nan where nothing could be fitted. `sizes`: a term's amplitude as the true model fits it, low and high of its 90 % interval as a
-    diagnosis states them (`amplitude.sized`).
+    `gain_nats` and `bar_nats`, what visible takes; nan where nothing could be fitted. `sizes`: a term's amplitude as
+    the true model fits it, low and high of its 90 % interval as a diagnosis states them (`amplitude.sized`).
 
     `visible` None: unknown, since no candidate describes the term.
     """

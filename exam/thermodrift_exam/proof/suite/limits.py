@@ -36,8 +36,8 @@ from thermodrift_exam.proof.suite.sizes import ALL_OR_NOTHING, most
 from twin.schema import twin_part
 
 HOW = (
-    "Size at which an effect's own signature, with recalibration and structure integrated out, is expected to gain what "
-    "a claim takes that nothing else resembles; median over development plants that lack nothing else."
+    "Size at which an effect's own signature, with recalibration and structure integrated out, is expected to gain "
+    "what a claim takes that nothing else resembles; median over development plants that lack nothing else."
 )
 MOST = 40.0  # the largest size
 SELDOM = ("mandrel",)  # most machines are measured without one
