@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from data.batch import Batch
 from data.errors import InputError, WorkError
-from data.machine import LEAD_ROWS, Machine
+from data.machine import Machine
 from data.processes import Processes
 from diagnosis.candidates.free_forms import Form
 from diagnosis.contracts import Fitted, Where
@@ -59,6 +59,7 @@ from diagnosis.search.refits import Progress
 from diagnosis.search.search import Search, search, start_worker
 from twin.calibration.identifiability import Interval, intervals90
 from twin.calibration.least_squares import result
+from twin.calibration.recorder import lead_remarks
 from twin.compile import compile_network
 from twin.schema import TwinPart, twin_part
 
@@ -149,7 +150,7 @@ def _diagnosis(
     part_after = with_deviations(final)
     drafted, units = machine.twin is None, {r.channel: r.unit for r in rms}
     remarks += tuple(i.words for i in impossible(done.baseline))
-    remarks += _lead_remarks(machine, final)
+    remarks += lead_remarks(machine, final.lead_rows)
     worse = {} if drafted else worsened(rows_as_given(on_all_rows(done.baseline, batches)), left_out_rows(full))
     if worse:
         remarks += (f"the machine file keeps its values and parts: the fitted ones raise {made.rises(worse, units)}",)
@@ -225,18 +226,6 @@ def _diagnosis(
         plan_text=(run.plan_text or None) if run is not None else None,
         search=done,
         **({} if worse else new_file),
-    )
-
-
-def _lead_remarks(machine: Machine, fitted: Fitted) -> tuple[str, ...]:
-    """When drivers act, where that was learned and is not from their row on."""
-    if machine.recording.drivers is not None or not fitted.lead_rows:
-        return ()
-    meant = next(name for name, rows in LEAD_ROWS.items() if rows == fitted.lead_rows)
-    row = "half a row" if fitted.lead_rows < 1.0 else "a row"
-    return (
-        f"a change of a driver comes {row} before the row that first shows it (learned from the recordings; "
-        f"recording.drivers: {meant} in the machine file states it)",
     )
 
 

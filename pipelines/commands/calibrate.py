@@ -87,7 +87,7 @@ def _left_out_rms(found: Calibration) -> dict[str, float]:
 
 
 def _remarks(found: Calibration) -> str:
-    parts = [found.fit.message]
+    parts = [found.fit.message, *found.remarks]
     if found.left_out is not None:
         parts.append(f"left_out_rms: mean over {found.left_out.summary}")
     return "; ".join(parts)
@@ -104,6 +104,7 @@ def calibration_dict(outcome: CalibrationOutcome) -> dict[str, Any]:
         "report": str(outcome.report) if outcome.report else None,
         "batches": list(c.batches),
         "account": outcome.account.as_dict(),
+        "remarks": list(c.remarks),
         "fit": {"words": c.fit.message, "converged": c.fit.converged, "cost": c.fit.cost, "rows": c.fit.rows,
                 "dof": c.fit.dof, "at_bound": list(c.fit.at_bound)},
         "parameters": [
@@ -131,6 +132,8 @@ def print_calibration(outcome: CalibrationOutcome) -> None:
         f"{c.machine.machine}: {len(c.unknowns)} parameters from {len(c.batches)} batches{label}; {c.fit.message}"
     )
     console.line(outcome.account.summary)
+    for remark in c.remarks:
+        console.line(remark)
     console.out.print(parameter_table(c))
     if c.undetermined:
         console.line("not determined by these recordings")

@@ -12,7 +12,7 @@ import pandas as pd
 
 from data.batch import Batch
 from data.errors import InputError, check_suffix
-from data.machine import Machine
+from data.machine import LEAD_ROWS, Machine
 from reports.drawing import picture, picture_bytes
 from reports.layout import Group, Heading, Items, Page, Pairs, Section, Text, given
 from reports.rendering import write_page
@@ -28,7 +28,7 @@ from twin.network import Network
 from twin.quantity import Parameter
 from twin.schema import twin_part
 from twin.simulation import choose_substeps, simulate
-from twin.simulation.inputs import Inputs, inputs_of
+from twin.simulation.inputs import Inputs, acting, inputs_of
 from twin.simulation.start import Steady, steady_state
 from twin.views.compared import Compared, compared, rms_table
 from twin.views.heat_flows import HeatFlows, heat_flows
@@ -204,7 +204,8 @@ def twin_data(
     """
     network = compile_network(machine) if calibration is None else calibration.network
     part = expanded(twin_part(machine))
-    inputs = inputs_of(network, batches) if batches else None
+    lead_rows = LEAD_ROWS[machine.recording.drivers or "held"] if calibration is None else calibration.lead_rows
+    inputs = inputs_of(network, acting(batches, lead_rows)) if batches else None
     if inputs is not None:
         inputs = inputs.refined(choose_substeps(network, network.values, inputs))
     drivers, steady = _steady(network, inputs)
@@ -247,5 +248,5 @@ def _origin(calibration: Calibration | None) -> str:
 
 def _findings(calibration: Calibration) -> tuple[str, ...]:
     """Remarks on the fit, on what the recordings leave undetermined, and on the residuals."""
-    said = [calibration.fit.message, *(u.summary for u in calibration.undetermined)]
+    said = [calibration.fit.message, *calibration.remarks, *(u.summary for u in calibration.undetermined)]
     return tuple(s for s in (*said, *calibration.whiteness_in_words.values()) if s)

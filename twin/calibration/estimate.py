@@ -20,10 +20,11 @@ from twin.calibration.fit_problem import Unknown
 from twin.calibration.identifiability import Interval, Undetermined, correlation, intervals90, undetermined
 from twin.calibration.least_squares import Fit, FitOptions, fit
 from twin.calibration.problem import EVERY_S, CalibrationProblem
+from twin.calibration.recorder import lead_remarks, settled_with_lead
 from twin.calibration.whiteness import in_words, whiteness
 from twin.compile import compile_network
 from twin.network import Network
-from twin.simulation.inputs import MAX_GAP_S
+from twin.simulation.inputs import MAX_GAP_S, acting
 
 COLUMNS = ("batch", "channel", "unit", "rows", "left_out", "before", "zero")
 
@@ -70,6 +71,7 @@ class LeftOut:
         return summary + (f"; the fit did not converge without {', '.join(lost)}" if lost else "")
 
 
+LEAD_TOLERANCE = 0.1  # of the fits that say when drivers act: their posteriors differ by tens of nats
 TOLERANCE = 1e-3  # of the fit: parameters within 3 % of a posterior standard deviation of their optimum
 
 
@@ -166,7 +168,8 @@ class Calibration:
     `network` has the new values, each with its old centre as prior. `rms` has a row per batch and channel, columns
     `RMS_COLUMNS`, in the channel's unit: free-running from first readings with the machine file's values (`before`)
     and with the new ones (`after`), and with the batch's own start and offsets as fitted (`fitted`). `whiteness` is
-    that of the fitted residual. `left_out` is None where no batch was left out.
+    that of the fitted residual. `left_out` is None where no batch was left out. A driver's change comes `lead_rows`
+    before the row that first shows it.
     """
 
     machine: Machine
@@ -179,6 +182,7 @@ class Calibration:
     whiteness: pd.DataFrame
     left_out: LeftOut | None
     seconds: Mapping[str, float]
+    lead_rows: float = 0.0
 
     @cached_property
     def values(self) -> dict[str, float]:
@@ -199,6 +203,11 @@ class Calibration:
     def undetermined(self) -> list[Undetermined]:
         """Combinations that the recordings do not determine, least determined first."""
         return undetermined(self.fit, self.unknowns)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What was learned of the recordings besides values."""
+        return lead_remarks(self.machine, self.lead_rows)
 
     @cached_property
     def whiteness_in_words(self) -> dict[str, str]:
@@ -221,8 +230,14 @@ def calibrate(
     begun = time.perf_counter()
     check_batches(machine, batches)
     network = compile_network(machine)
-    problem = CalibrationProblem.of(network, batches, options.every_s, options.channels, options.max_gap_s)
+
+    def problem_at(lead_rows: float) -> CalibrationProblem:
+        own = acting(batches, lead_rows)
+        return CalibrationProblem.of(network, own, options.every_s, options.channels, options.max_gap_s)
+
     report = (lambda text: progress(text, 0, 0)) if progress else None
+    rough = replace(options, starts=1, tolerance=max(options.tolerance, LEAD_TOLERANCE))
+    lead_rows, problem, *_ = settled_with_lead(machine, problem_at, rough, progress=report)
     done = fit(problem, options, report)
     if not (done.converged and np.isfinite(done.x).all() and np.isfinite(done.covariance).all()):
         raise WorkError(
@@ -242,6 +257,7 @@ def calibrate(
         whiteness=whiteness(problem.residual_series(done.x, done.nuisance)),
         left_out=left_out,
         seconds={"fit": fitted - begun, "leave out": time.perf_counter() - fitted},
+        lead_rows=lead_rows,
     )
 
 

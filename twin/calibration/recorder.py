@@ -47,3 +47,15 @@ def settled_with_lead(
         if (level := log_posterior(problem, state, inflation)) > most:
             best, most = (lead_rows, problem, state, notes), level
     return best
+
+
+def lead_remarks(machine: Machine, lead_rows: float) -> tuple[str, ...]:
+    """When drivers act, where that was learned and is not from their row on."""
+    if machine.recording.drivers is not None or not lead_rows:
+        return ()
+    meant = next(name for name, rows in LEAD_ROWS.items() if rows == lead_rows)
+    row = "half a row" if lead_rows < 1.0 else "a row"
+    return (
+        f"a change of a driver comes {row} before the row that first shows it (learned from the recordings; "
+        f"recording.drivers: {meant} in the machine file states it)",
+    )
