@@ -43,6 +43,7 @@ from diagnosis.fitting.batches import enough_batches, usable_batches
 from diagnosis.fitting.fitted import (
     baseline,
     check,
+    harms,
     left_out_rows,
     on_all_rows,
     plain,
@@ -154,6 +155,11 @@ def _diagnosis(
     worse = {} if drafted else worsened(rows_as_given(on_all_rows(done.baseline, batches)), left_out_rows(full))
     if worse:
         remarks += (f"the machine file keeps its values and parts: the fitted ones raise {made.rises(worse, units)}",)
+    harmful = [r.best.candidate.label for r in named if r.best is not None and harms(left_out_rows(r.before), after)]
+    remarks += tuple(
+        f"{label}: named, and kept out of the machine file: simulated alone, runs left out are predicted worse with it"
+        for label in harmful
+    )
     run = settling_run(named)
     separates = run.label if run is not None else ""
     found = []
@@ -225,7 +231,7 @@ def _diagnosis(
         network=final.problem.network,
         plan_text=(run.plan_text or None) if run is not None else None,
         search=done,
-        **({} if worse else new_file),
+        **({} if worse or harmful else new_file),
     )
 
 

@@ -101,19 +101,21 @@ def count(n: int) -> str:
 
 
 def kinds() -> str:
-    """The diagnosis on a fresh seed of other kinds of machine."""
+    """The diagnosis on fresh seeds of other kinds of machine."""
     rows, about = table("diagnosis_kinds")
-    single, nothing = rows[rows["concealed"] != "nothing"], rows[rows["concealed"] == "nothing"]
-    visible, claimed = single[single["visible"] == "yes"], single[single["claimed"] != ""]
-    named = Share(int((visible["right"] == "yes").sum()), len(visible))
-    wrong = Share(int((claimed["right"] == "no").sum()), len(claimed))
-    false = int((nothing["claimed"] != "").sum())
-    most = 1.0 - 0.05 ** (1.0 / len(nothing))
-    assert false == 0, "state the false alarms with an interval"
+    effects = rows["concealed"].map(lambda text: 0 if text == "nothing" else text.count("+") + 1)
+    nothing, single, double = (rows[effects == n].replace({"visible": {"": 0}, "named": {"": 0}}) for n in (0, 1, 2))
+    visible = single[single["visible"].astype(int) > 0]
+    named = Share(int((visible["named"].astype(int) > 0).sum()), len(visible))
+    made_of = rows["claimed"].map(lambda text: len([name for name in text.split("; ") if name]))
+    true = Share(int(rows["true"].sum()), int(made_of.sum()))
+    false = Share(int((nothing["claimed"] != "").sum()), len(nothing))
+    both = Share(int((double["named"].astype(int) == 2).sum()), len(double))
     return (
-        f"{len(rows)} simulated cases of one seed that chose nothing, {rows['kind'].nunique()} kinds of machine, "
-        f"version {about['version']}: {named} visible single effects named ({named.interval}), {wrong} claims wrong, "
-        f"no false alarm in {len(nothing)} (at most {100 * most:.0f} %)."
+        f"{len(rows)} simulated cases of seeds that chose nothing, {rows['kind'].nunique()} kinds of machine, version "
+        f"{about['version']}: {named} visible single effects named ({named.interval}), {true} claims true "
+        f"({true.interval}), false alarms in {false} cases where nothing was missing ({false.interval}), both of two "
+        f"effects in {both} cases."
     )
 
 

@@ -366,7 +366,7 @@ class LeftOutRows:
     rms: pd.DataFrame
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=4)  # a fit holds some 100 MB
 def plain(fitted: Fitted) -> Fitted:
     """The same twin part calibrated to simulate alone: each channel's misfit is its noise, and rows that repeat each
     other count as one (`twin.calibration`). What a machine file states is simulated without structure.
@@ -404,7 +404,7 @@ def calibrated(at: Point, noise: Noise, runs: int = 0) -> Fitted:
     return _begun(at, independent(at.problem, 1.0 / np.sqrt(noise.weight)), Hyper(), runs)
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=4)  # a fit holds some 100 MB
 def left_out_rows(fitted: Fitted) -> LeftOutRows:
     """Every batch predicted, free-running, by the `plain` fit to all others; its starts and zeros are its own."""
     return _left_out(plain(fitted))
@@ -444,6 +444,14 @@ def worsened(before: LeftOutRows, after: LeftOutRows) -> dict[str, tuple[float, 
     rise, n = new.mean() - old.mean(), len(old)
     se = np.sqrt((old.var(ddof=min(1, n - 1)) + new.var(ddof=min(1, n - 1))) / n)
     return {str(c): (float(old[c].mean()), float(new[c].mean())) for c in rise.index[rise > se]}
+
+
+def harms(before: LeftOutRows, after: LeftOutRows) -> bool:
+    """Whether left-out runs are predicted worse after, by more than the standard error over runs of the difference: the
+    logarithm of the rms, mean over channels, each run paired with itself."""
+    old, new = (np.log(r.rms.pivot(index="batch", columns="channel", values="rms")) for r in (before, after))
+    rise = (new - old).mean(axis=1)
+    return bool(rise.mean() > rise.std(ddof=min(1, len(rise) - 1)) / np.sqrt(len(rise)))
 
 
 def _rows_left(problem: CalibrationProblem, every_z: Sequence[Array], nuisance: Sequence[Array]) -> LeftOutRows:

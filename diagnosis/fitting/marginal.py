@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from data.arrays import Array, Mask
+from data.arrays import Array
 from diagnosis.fitting.covariance import Covariance
 from diagnosis.policy import POLICY
 
@@ -155,27 +155,30 @@ class Level:
             for n, s in zip(of.own_own, self.own_size, strict=True)
         ]
         self._taken = [self.beyond(b, d) * size for b, d in enumerate(of.own_along)]
-        information = [d * size * size[:, None] - t.T @ t for d, t in zip(of.along_along, self._taken, strict=True)]
-        self.information = np.stack(information)  # (B, K, K)
         self._volume = np.array([2.0 * float(np.log(np.diag(r)).sum()) for r in self._root]) + covariance.log_det
 
     def beyond(self, b: int, own: Array) -> Array:
         """What a batch's own unknowns take of columns, from their products (q_b, m) with these."""
         return solve_triangular(self._root[b], own * self.own_size[b][:, None], lower=True)
 
+    def _information(self, b: int) -> Array:
+        """Of a batch on the directions, own unknowns taken out, (K, K)."""
+        size, taken = self.size, self._taken[b]
+        return np.asarray(self.of.along_along[b] * size * size[:, None] - taken.T @ taken)
+
+    @cached_property
+    def _total(self) -> Array:
+        return np.asarray(np.sum([self._information(b) for b in range(self.of.batches)], axis=0))
+
     @cached_property
     def factor(self) -> tuple[Array, bool]:
         """Cholesky of the directions' information and prior in all batches."""
-        return self._factor(np.ones(self.of.batches, bool))
+        return _factor(self._total)
 
     @cached_property
     def folds(self) -> list[tuple[Array, bool]]:
         """The same without each batch in turn."""
-        return [self._factor(kept) for kept in ~np.eye(self.of.batches, dtype=bool)]
-
-    def _factor(self, kept: Mask) -> tuple[Array, bool]:
-        information = self.information[kept].sum(axis=0)
-        return cho_factor(information + np.eye(len(information)), lower=True)
+        return [_factor(self._total - self._information(b)) for b in range(self.of.batches)]
 
     def products(self, grams: Grams) -> tuple[Array, Array]:
         """Products (B, m, m) of columns with each other and (B, K, m) with the directions, own unknowns taken out."""
@@ -251,3 +254,7 @@ class Level:
             own = solve_triangular(self._root[b], self.beyond(b, (of.own[b].T @ rest)[:, None]), lower=True, trans="T")
             out.append(rest - of.own[b] @ (self.own_size[b] * own[:, 0]))
         return out
+
+
+def _factor(information: Array) -> tuple[Array, bool]:
+    return cho_factor(information + np.eye(len(information)), lower=True)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from data.errors import InputError
 from pipelines import console
 from pipelines.options import Json
 
@@ -25,13 +26,24 @@ def demonstration_dict(d: Demonstration) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def today_seed() -> int:
-    """Today's date as YYYYMMDD."""
-    return int(f"{date.today():%Y%m%d}")
+FIXED_SEED = 1  # everybody sees the same demonstration; the documentation has a table of others
+
+
+def seed_of(given: str) -> int:
+    """The seed that was given: a number, or "today" for today's date as YYYYMMDD.
+
+    Raises:
+        InputError: anything else.
+    """
+    if given == "today":
+        return int(f"{date.today():%Y%m%d}")
+    if not given.isdecimal():
+        raise InputError(f'--seed: got {given!r}, expected a whole number from 0, or "today"')
+    return int(given)
 
 
 def demonstrate(
-    seed: Annotated[int | None, typer.Option(help="draws what is concealed; default: today's date, YYYYMMDD")] = None,
+    seed: Annotated[str, typer.Option(help='draws what is concealed; "today" is today\'s date')] = str(FIXED_SEED),
     to: Annotated[Path | None, typer.Option("--out", help="folder of the page; default: var/demonstration")] = None,
     as_json: Json = False,
 ) -> None:
@@ -45,7 +57,7 @@ def demonstrate(
             console.line(text)
 
     with console.progress(as_json) as (_, done):
-        d = work(today_seed() if seed is None else seed, to or home() / "demonstration", say, done)
+        d = work(seed_of(seed), to or home() / "demonstration", say, done)
     if as_json:
         console.print_json(demonstration_dict(d))
     else:
