@@ -25,7 +25,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 # The keys of a finding's evidence; others may be added.
 EVIDENCE: Mapping[str, str] = {
     "gain_nats": "rise of the log score of the batches left out, in nats",
-    "threshold_nats": "gain from which on an effect that nothing else resembles is claimed",
+    "threshold_nats": "gain from which on an effect is claimed",
     "relative_gain": "gain over the absolute log evidence of the fit before, which the probability follows",
     "lead_share": "share of the gain that the best explanation of another mechanism and place lacks",
     "batches_improved": "left-out batches whose error falls",

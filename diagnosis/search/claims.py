@@ -1,9 +1,9 @@
-"""How probable a claim is: a logistic model of figures that are free of scale.
+"""How probable a claim is: a logistic model of a figure that is free of scale.
 
 What a wrong claim gains in nats grows with the recordings and with what a network cannot represent. So a claim is
-judged by what it gains relative to the log evidence of the fit before it, by the odds of its mechanism, by its lead
-over the best explanation that differs in place and mechanism, and by the share of runs that it predicts better. The
-weights are fitted to development cases of several kinds of machine (`results/claims.csv`).
+judged by what it gains relative to the log evidence of the fit before it. Offset and weight are fitted to development
+cases of several kinds of machine (`results/claims.csv`). Of the other figures that stand there (odds of the mechanism,
+lead over what differs, share of runs) none makes it better, left-out kinds judged.
 """
 
 from __future__ import annotations
@@ -21,11 +21,9 @@ from diagnosis.screening.screen import Screen
 
 @dataclass(frozen=True)
 class Figures:
-    """What a claim is judged by; none has a unit.
-
-    `relative_gain`: nats gained over the absolute log evidence of the fit before. `log_odds` of the mechanism before
-    the recordings. `lead`: share of the gain that the best different explanation lacks. `agreeing`: share of the runs.
-    """
+    """Of a claim, free of units: `relative_gain`, nats gained over the absolute log evidence of the fit before, which its
+    probability follows; `log_odds` of the mechanism before the recordings; `lead`, the share of the gain that the best
+    different explanation lacks; `agreeing`, the share of the runs that are predicted better."""
 
     relative_gain: float
     log_odds: float
@@ -35,20 +33,14 @@ class Figures:
     @property
     def probability(self) -> float:
         """That the claim is true."""
-        return float(1.0 / (1.0 + np.exp(-self._score(np.log(max(self.relative_gain, 1e-9))))))
-
-    def _score(self, log_gain: float) -> float:
-        offset, *weights = POLICY.claim_weights
-        return offset + float(np.dot(weights, [log_gain, self.log_odds, self.lead, self.agreeing]))
-
-    @property
-    def least_relative_gain(self) -> float:
-        """The relative gain from which on a claim with these other figures is made."""
-        p = POLICY.claim_min_probability
-        return float(np.exp((np.log(p / (1.0 - p)) - self._score(0.0)) / POLICY.claim_weights[1]))
+        score = POLICY.claim_offset + POLICY.claim_weight * np.log(max(self.relative_gain, 1e-9))
+        return float(1.0 / (1.0 + np.exp(-score)))
 
 
-PLAIN = Figures(1.0, 0.0, 1.0, 1.0)  # of a claim that nothing but its size speaks against
+def least_relative_gain() -> float:
+    """From which on a claim is made."""
+    p = POLICY.claim_min_probability
+    return float(np.exp((np.log(p / (1.0 - p)) - POLICY.claim_offset) / POLICY.claim_weight))
 
 
 @dataclass(frozen=True)
@@ -83,8 +75,8 @@ class Round:
 
     @property
     def threshold(self) -> float:
-        """Nats from which on an effect that nothing else resembles would be claimed."""
-        return PLAIN.least_relative_gain * abs(self.before.log_evidence)
+        """Nats from which on an effect is claimed."""
+        return least_relative_gain() * abs(self.before.log_evidence)
 
 
 def figures(before: Fitted, tried: Sequence[Tried]) -> Figures:

@@ -53,7 +53,7 @@ GLOSSARY = (
     ("before, after", "The recalibrated simulation without and with what was found."),
     ("noise floor", "The rms that noise alone leaves to any simulation."),
     ("gain", "Rise of the log score (log likelihood) of the left-out runs, in nats; from the threshold on an "
-     "effect that nothing else resembles is claimed."),
+     "effect is claimed."),
     ("absorbed", "Share of an effect's signature that recalibrating the other parameters imitates. Near 100 %, only "
      "its prior keeps it apart."),
     ("unexplained heat, displacement, reading", "What a smooth free input at that place would have to be to close the "

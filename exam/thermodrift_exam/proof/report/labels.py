@@ -29,7 +29,7 @@ _METHODS = {
     "diagnosis": "the diagnosis", "raw_correlation": "largest raw correlation",
     "sparse_regression": "sparse regression on the residual", "in_sample_bic": "forward selection, in-sample BIC",
     "reference": "first round, full rules", "no_projection": "without projection",
-    "independent_noise": "rows as independent noise", "no_veto": "without the veto of left-out errors",
+    "independent_noise": "rows as independent noise",
     "no_floor_check": "without the floor check",
 }  # fmt: skip
 GROUPS = {"diagnosis": "Diagnosis", "baseline": "Baselines, same first fit", "ablation": "Ablations, first round only"}

@@ -26,7 +26,7 @@ from data.batch import Batch
 from data.files import write_atomic
 from diagnosis.contracts import Fitted
 from diagnosis.fitting.fitted import baseline
-from diagnosis.search.claims import PLAIN
+from diagnosis.search.claims import least_relative_gain
 from thermodrift_exam.plants.effects import EFFECTS
 from thermodrift_exam.plants.options import stream
 from thermodrift_exam.plants.plant import draw, posed
@@ -37,7 +37,7 @@ from twin.schema import twin_part
 
 HOW = (
     "Size at which an effect's own signature, with recalibration and structure integrated out, is expected to gain "
-    "what a claim takes that nothing else resembles; median over development plants that lack nothing else."
+    "what a claim takes; median over development plants that lack nothing else."
 )
 MOST = 40.0  # the largest size
 SELDOM = ("mandrel",)  # most machines are measured without one
@@ -64,7 +64,7 @@ class Bench:
         options = {**setting(seed, "development"), **EVEN, "has": list(stated), "lacks": lacks, "solver_s": STEP_S}
         case = draw(seed, plant=plant, **options)
         fitted = baseline(case.machine, twin_part(case.machine), case.batches, None, len(case.batches))
-        return cls(seed, plant, options, fitted, PLAIN.least_relative_gain * abs(fitted.log_evidence))
+        return cls(seed, plant, options, fitted, least_relative_gain() * abs(fitted.log_evidence))
 
     def clean(self, sizes: Mapping[str, float]) -> list[Batch]:
         """The same runs without noise, with effects of these sizes."""
