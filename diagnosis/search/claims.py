@@ -21,9 +21,9 @@ from diagnosis.screening.screen import Screen
 
 @dataclass(frozen=True)
 class Figures:
-    """Of a claim, free of units: `relative_gain`, nats gained over the absolute log evidence of the fit before, which its
-    probability follows; `log_odds` of the mechanism before the recordings; `lead`, the share of the gain that the best
-    different explanation lacks; `agreeing`, the share of the runs that are predicted better."""
+    """Of a claim, free of units: `relative_gain`, nats gained over the absolute log evidence of the fit before, which
+    its probability follows; `log_odds` of the mechanism before the recordings; `lead`, the share of the gain that the
+    best different explanation lacks; `agreeing`, the share of the runs that are predicted better."""
 
     relative_gain: float
     log_odds: float
