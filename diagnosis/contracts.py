@@ -181,7 +181,7 @@ class Scored:
     """A candidate with what the screen says of it; the amplitude in its own unit (of a value's logarithm: a factor).
 
     `gain` in nats of log evidence, `absorbed` the share of its signature that a recalibration and structure take, `sd`
-    of its amplitude, `column` of its signature in the screen, -1 where it has none.
+    of its amplitude, `prior` the sd of that before, `column` of its signature in the screen, -1 where it has none.
     """
 
     candidate: Candidate
@@ -189,6 +189,7 @@ class Scored:
     absorbed: float = 0.0
     amplitudes: Mapping[str, float] = field(default_factory=dict)
     sd: float = 0.0
+    prior: float = 0.0
     column: int = -1
 
 

@@ -116,6 +116,11 @@ class Policy:
     amplitude_min_log_sd: float = physical(1.5, "log", "machines differ by more than their handbook values")
     amplitude_start_sd: float = convention(2.0, "prior sd", "a screened start lies no further from the usual value")
     signed_prior_sd_factor: float = physical(3.0, "usual spreads", "prior sd of a signed amplitude")
+    unusual_size_factor: float = convention(
+        1000.0,
+        "sd in the screen",
+        "prior sd of an amplitude without a usual size: a bent fit may show a hundredth of it",
+    )
     signed_start_factor: float = convention(2.0, "of the start", "least prior sd, so that the start is plausible")
     shape_default_sd: float = physical(0.5, "log, or the parameter's unit", "prior of a shape whose law states none")
     unnamed_equipment_odds: float = physical(0.05, "odds", "a machine file seldom leaves out what the machine has")

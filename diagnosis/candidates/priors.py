@@ -63,7 +63,7 @@ def start_values(s: Scored, now: Point) -> tuple[Mapping[str, Value], Mapping[st
     for amplitude, off in c.amplitudes.items():
         spec = at_size(mechanism.spec(amplitude), size)
         if mechanism.any_unit:  # per unit of whatever drives it: no size is usual
-            spec = replace(spec, spread=0.0)
+            spec = replace(spec, spread=POLICY.unusual_size_factor * s.prior / POLICY.signed_prior_sd_factor)
         begin = off + found.get(amplitude, 0.0)
         values[amplitude], begin = _free(spec, off, begin)
         at[f"mechanisms.{c.name}.{amplitude}"] = begin

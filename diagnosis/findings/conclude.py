@@ -296,7 +296,7 @@ def _network_name(final: Fitted, instance: str, parameter: str, place: str) -> s
 
 def caps(n: int) -> tuple[str, ...]:
     """Remarks on what limits a probability."""
-    return () if n >= POLICY.few_runs else (f"{n} runs only",)
+    return () if n >= POLICY.few_runs else (f"{n} run{'s' if n > 1 else ''} only",)
 
 
 def slow_residual_ratio(rms: Sequence[Rms], fitted: Fitted) -> float:

@@ -112,7 +112,8 @@ def claim_phrase(found: Found) -> str:
     """What is missing, where and how much, without a full stop; the first letter is a capital."""
     if found.tied:
         # what is claimed may be the less likely: a likelier one that looks alike may fail a criterion
-        own = (found.probability, f"{effect_phrase(found)}{_size(found)} ({percent(found.probability)})")
+        alone = found.probability - sum(o.probability for o in found.others if o.alike)
+        own = (alone, f"{effect_phrase(found)}{_size(found)} ({percent(alone)})")
         tied = [(o.probability, f"{_other_phrase(o)} ({percent(o.probability)})") for o in found.tied]
         said = [text for _, text in sorted([own, *tied], key=lambda s: -s[0])]
         numbers = {2: "two", 3: "three", 4: "four"}

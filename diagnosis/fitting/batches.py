@@ -29,9 +29,11 @@ def enough_batches(batches: Sequence[Batch]) -> tuple[list[Batch], tuple[str, ..
     for batch in batches:
         n = max(1, min(each, batch.n_rows // POLICY.min_block_rows))
         out += _cut(batch, n)
+    few = POLICY.few_runs_max_probability
     remarks = (
         f"{len(batches)} run{'s' if len(batches) != 1 else ''} only: cut into {len(out)} blocks that are left out in "
-        "turn; blocks of one run share its weather and its state, so no probability above 0.9 is reported",
+        "turn; blocks of one run share its weather and its state, so no probability above "
+        f"{few[max(1, len(batches)) - 1]:g} is reported",
     )
     return out, remarks
 

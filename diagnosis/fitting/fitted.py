@@ -141,7 +141,7 @@ def _learned(at: Point, structure: Structure, runs: int, shares: Sequence[float]
     """The fit under the likeliest covariance. A channel in which no draw shows what it leaves, as where a nut passes a
     sensor, has more noise."""
     covariance, hyper = _likeliest(at, structure, shares, begin)
-    fitted, factor = _fitted(at, covariance, hyper, runs), np.ones(len(at.problem.channels))
+    fitted, factor = tuned(_fitted(at, covariance, hyper, runs)), np.ones(len(at.problem.channels))
     for _ in range(POLICY.channel_rounds):
         new = np.maximum(factor * _excess(fitted), 1.0)
         change = new / factor

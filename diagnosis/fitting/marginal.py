@@ -205,8 +205,11 @@ class Level:
         return self._log_evidence(self.products(grams))
 
     def _log_evidence(self, products: tuple[Array, Array], without: int | None = None) -> float:
-        c = self._reduced(*products, without)
-        root = np.linalg.cholesky(c[:-1, :-1] + self.prior * np.eye(len(c) - 1))
+        try:
+            c = self._reduced(*products, without)
+            root = np.linalg.cholesky(c[:-1, :-1] + self.prior * np.eye(len(c) - 1))
+        except np.linalg.LinAlgError:  # columns of values that no machine has
+            return -np.inf
         fitted = solve_triangular(root, c[:-1, -1], lower=True)
         factor = self.factor if without is None else self.folds[without]
         logs = 2.0 * float(np.log(np.diag(root)).sum() + np.log(np.diag(factor[0])).sum())

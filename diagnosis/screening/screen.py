@@ -112,8 +112,10 @@ def screen(fitted: Fitted, every: Sequence[Candidate], before: Screen | None = N
         k = max(columns, key=lambda k: gain[k])
         name = (*one.amplitudes, "factor")[columns.index(k)]
         scored.append(
-            Scored(one, float(gain[k]), float(absorbed[k]), {name: float(amplitude[k])}, float(sd[k]), k)
-        )  # fmt: skip
+            Scored(
+                one, float(gain[k]), float(absorbed[k]), {name: float(amplitude[k])}, float(sd[k]), float(prior[k]), k
+            )
+        )
     return Screen(tuple(sorted(scored, key=lambda s: (-s.gain, s.candidate.name))), seen, own.shadow)
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.special import softmax
 
 from diagnosis.contracts import Fitted, Tried
 from diagnosis.policy import POLICY
@@ -131,14 +132,13 @@ def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     standing = np.array([t.standing for t in done.tried] + [done.threshold, other])
     if done.resolved:
         standing[-2] = -np.inf
-    weight = np.exp((standing - standing.max()) / scale)
     if best is None:
-        weight /= weight.sum()
+        weight = softmax(standing / scale)
         return [], float(weight[-2]), float(weight[-1])
     like = np.array([t is best or alike(best, t) for t in done.tried] + [False, False])
     own = min(done.trust, probability_cap(runs))
-    weight[like] *= own / weight[like].sum()
-    weight[~like] *= (1.0 - own) / max(weight[~like].sum(), 1e-300)
+    weight = np.empty(len(standing))
+    weight[like], weight[~like] = own * softmax(standing[like] / scale), (1.0 - own) * softmax(standing[~like] / scale)
     every = zip(done.tried, weight.tolist(), like.tolist(), strict=False)
     out = [Explanation(t, p, a) for t, p, a in every]
     return [out[0], *sorted(out[1:], key=lambda e: -e.probability)], float(weight[-2]), float(weight[-1])

@@ -62,6 +62,8 @@ def _judged_together(
             done = one_round(_less(full, rounds[k], baseline), workers, tell, rounds[k].screen)
         except (InputError, WorkError):
             continue  # no machine is without it
+        if done.best is not None and done.best.fitted.log_evidence < full.log_evidence - POLICY.telling_nats:
+            continue  # the effects as they were grown explain more
         rounds[k] = done
         full = done.best.fitted if done.best is not None else done.before
     for k in grown:
@@ -124,8 +126,8 @@ def _settled(now: Fitted, t: Tried) -> Tried:
 
 
 def _resolves(t: Tried, before: frozenset[str]) -> frozenset[str]:
-    """Channels that show what the fit before cannot do whatever its values, and that this one can."""
-    return before - {i.channel for i in impossible(t.fitted)} if before else frozenset()
+    """Channels that show what the fit before cannot do whatever its values, and that this one can and so gains."""
+    return before - {i.channel for i in impossible(t.fitted)} if before and t.gain > 0 else frozenset()
 
 
 def _fair(now: Fitted, tried: list[Tried]) -> tuple[Fitted, list[Tried]]:

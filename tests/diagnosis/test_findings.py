@@ -22,7 +22,7 @@ RAW: dict[str, Any] = {
         "when": {"regime": "spindle_rpm > 0", "windows": [["b1", 123456.78, 200000.0]]},
         "parameters": {"conductance": {"value": 10.23456, "unit": "W/K", "interval90": [8.9, 11.6]}},
         "probability": 0.97,
-        "alternatives": [{"mechanism": "radiation", "where": BED, "probability": 0.02}],
+        "alternatives": [{"mechanism": "radiation", "where": BED, "probability": 0.02, "alike": True}],
         "equation": "P = 10.2 W/K · (T_floor - T)", "statement": "Missing: heat to the floor.",
         "evidence": {"gain_nats": 41.23456, "left_out_rms": {"before": {"z_um": 9.123456}}},
     }],
@@ -67,6 +67,15 @@ def test_what_is_not_known_is_null_and_what_is_not_certain_is_below_one() -> Non
     assert told["findings"][0]["probability"] == 0.9999
     assert told["findings"][0]["evidence"] == {"sign_test_p": None, "batches": 3}
     assert Findings.from_json(told).seconds is None
+
+
+def test_an_alternative_of_an_older_file_is_not_alike() -> None:
+    plain = {"mechanism": "radiation", "where": BED, "probability": 0.02}
+    older = changed(findings=[RAW["findings"][0] | {"alternatives": [plain]}])
+    (now,), (then,) = (Findings.from_json(raw).findings[0].alternatives for raw in (RAW, older))
+    assert now.alike and not then.alike
+    told = json.loads(as_json(Findings.from_json(older)))["findings"][0]["alternatives"]
+    assert told == [plain | {"alike": False}]
 
 
 def test_a_file_reads_back_and_writes_the_same_text(tmp_path: Path) -> None:

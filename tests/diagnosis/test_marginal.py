@@ -1,7 +1,8 @@
-"""Evidence with structure and the batches' own unknowns integrated out, against dense normal distributions."""
+"""Evidence with structure, starts and values integrated out at any sizes of these, against dense normal densities."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -11,10 +12,14 @@ from scipy.stats import multivariate_normal
 
 from data.arrays import Array
 from diagnosis.fitting.covariance import Covariance, alone_in, clipped
-from diagnosis.fitting.marginal import Marginal
+from diagnosis.fitting.marginal import Grams, Hyper, Marginal
+from diagnosis.policy import POLICY
 
 ROWS, BATCHES, CHANNELS = 7, 3, 2
+ALL = list(range(BATCHES))
 P, K, OWN = 2, 3, 2
+DRAWN, STARTS = 2, 1  # of the directions, and of each batch's own unknowns
+HYPERS = [Hyper(), Hyper(0.5, 0.25, 0.3, 2.0), Hyper(0.0, 0.0, 0.1, 1.0), Hyper(8.0, 1.0, 1.0, 4.0)]
 
 
 @cache
@@ -39,18 +44,28 @@ def marginal() -> Marginal:
         {c: np.linalg.inv(np.linalg.cholesky(blocks()[CHANNELS * b + c])) for c in range(CHANNELS)}
         for b in range(BATCHES)
     )
-    covariance = Covariance((channel,) * BATCHES, roots, tuple(problem()["directions"]))
-    return Marginal(covariance, problem()["own"], [np.zeros(OWN)] * BATCHES)
+    covariance = Covariance((channel,) * BATCHES, roots, tuple(problem()["directions"]), drawn=DRAWN)
+    return Marginal(covariance, problem()["own"], [np.zeros(OWN)] * BATCHES, STARTS)
 
 
 def columns(*names: str) -> list[Array]:
     return marginal().white([np.hstack([problem()[n][b] for n in names]) for b in range(BATCHES)])
 
 
-def dense(names: list[str], batches: list[int]) -> float:
-    """Log density of the target of some batches, everything else integrated out."""
-    shared = np.vstack([np.hstack([problem()[n][b] for n in (*names, "directions")]) for b in batches])
-    own = block_diag(*(problem()["own"][b] for b in batches))
+def grams(*names: str) -> Grams:
+    return marginal().grams(columns(*names))
+
+
+def dense(names: list[str], batches: list[int], hyper: Hyper, sd: dict[str, float] | None = None) -> float:
+    """Log density of the target of some batches, everything else integrated out; `sd` of columns with a prior of their
+    own."""
+    size = np.repeat([hyper.structure, hyper.imperfections], [DRAWN, K - DRAWN])
+    scaled = {"directions": size} | {n: np.full(P if n == "model" else 1, hyper.values) for n in names}
+    scaled |= {n: np.array([value]) for n, value in (sd or {}).items()}
+    every = [*names, *(sd or {}), "directions"]
+    shared = np.vstack([np.hstack([problem()[n][b] * scaled[n] for n in every]) for b in batches])
+    own_size = np.where(np.arange(OWN) < STARTS, hyper.starts, 1.0)
+    own = block_diag(*(problem()["own"][b] * own_size for b in batches))
     noise = block_diag(*(blocks()[CHANNELS * b + c] for b in batches for c in range(CHANNELS)))
     target = np.concatenate([problem()["target"][b][:, 0] for b in batches])
     cov = noise + shared @ shared.T + own @ own.T
@@ -58,48 +73,92 @@ def dense(names: list[str], batches: list[int]) -> float:
     return float(multivariate_normal(np.zeros(len(target)), cov).logpdf(target)) + constant
 
 
-def test_the_evidence_is_a_normal_density() -> None:
-    grams = marginal().grams(columns("model", "target"))
-    assert marginal().log_evidence(grams) == pytest.approx(dense(["model"], [0, 1, 2]))
+every_hyper = pytest.mark.parametrize("hyper", HYPERS, ids=str)
 
 
-def test_a_left_out_batch_gains_what_its_conditional_density_does() -> None:
-    before, after = (marginal().grams(columns(*n, "target")) for n in (["model"], ["model", "more"]))
-    got = marginal().foretold(after) - marginal().foretold(before)
-    for b in range(BATCHES):
-        rest = [k for k in range(BATCHES) if k != b]
-
-        def conditional(names: list[str], rest: list[int] = rest) -> float:
-            return dense(names, [0, 1, 2]) - dense(names, rest)
-
-        assert got[b] == pytest.approx(conditional(["model", "more"]) - conditional(["model"]))
+@every_hyper
+def test_the_evidence_is_a_normal_density_at_any_sizes(hyper: Hyper) -> None:
+    """Of what is integrated out; the sizes scale products that are worked out once."""
+    assert marginal().level(hyper).log_evidence(grams("model", "target")) == pytest.approx(dense(["model"], ALL, hyper))
 
 
-def test_directions_of_another_size_need_no_new_products() -> None:
-    scale = np.array([0.5, 2.0, 0.0])
-    grams = marginal().grams(columns("model", "target"))
-    one = marginal().rescaled(scale)
-    afresh = Marginal(one.covariance, problem()["own"], [np.zeros(OWN)] * BATCHES)
-    assert one.log_evidence(grams.rescaled(scale)) == pytest.approx(
-        afresh.log_evidence(afresh.grams(columns("model", "target")))
-    )
+@every_hyper
+def test_a_left_out_batch_is_foretold_by_its_conditional_density(hyper: Hyper) -> None:
+    got = marginal().level(hyper).foretold(grams("model", "target"))
+    for b in ALL:
+        rest = [k for k in ALL if k != b]
+        assert got[b] == pytest.approx(dense(["model"], ALL, hyper) - dense(["model"], rest, hyper))
 
 
-def test_many_columns_are_multiplied_as_few_are() -> None:
-    few, many = columns("model", "target"), columns("more")
-    mixed, cross, squares = marginal().products(few, many)
-    every = marginal().grams(columns("model", "target", "more"))
-    np.testing.assert_allclose(mixed[:, 0], every.inner.sum(axis=0)[:-1, -1])
-    np.testing.assert_allclose(cross[:, 0], every.cross.sum(axis=0)[:, -1])
-    np.testing.assert_allclose(squares, every.inner.sum(axis=0)[-1, -1])
+@every_hyper
+def test_a_candidate_is_screened_as_if_it_were_one_more_column_of_the_model(hyper: Hyper) -> None:
+    """Its log Bayes factor for an amplitude of prior sd 3, its amplitude, and by how much the parameters move."""
+    level, sd = marginal().level(hyper), 3.0
+    scores = level.screened(grams("model", "target"), marginal().many(columns("model", "target"), columns("more")))
+    precision = scores.left[0] + 1.0 / sd**2
+    gain = 0.5 * scores.residual[0] ** 2 / precision - 0.5 * np.log(sd**2 * precision)
+    assert gain == pytest.approx(dense(["model"], ALL, hyper, {"more": sd}) - dense(["model"], ALL, hyper))
+    c = level.reduced(grams("model", "more", "target"))
+    z = np.linalg.solve(c[:-1, :-1] + np.diag([level.prior] * P + [1.0 / sd**2]), c[:-1, -1])
+    assert scores.residual[0] / precision == pytest.approx(z[-1])
+    without = level.optimum(grams("model", "target"))
+    np.testing.assert_allclose(without - scores.shadow[:, 0] * z[-1], z[:-1])
 
 
-def test_what_is_left_is_least() -> None:
-    x, grams = columns("model", "target"), marginal().grams(columns("model", "target"))
-    z = marginal().optimum(grams)
-    left = marginal().leftover(x, z, grams)
-    nearby = marginal().leftover(x, z + 0.1, grams)
-    assert sum(float(r @ r) for r in left) + z @ z < sum(float(r @ r) for r in nearby) + (z + 0.1) @ (z + 0.1)
+def test_without_a_batch_all_of_it_is_as_if_that_had_not_been_recorded() -> None:
+    """The optimum of a fold solves the normal equations of the dense covariance of the other batches."""
+    hyper = HYPERS[1]
+    for b in ALL:
+        rest = [k for k in ALL if k != b]
+        size = np.repeat([hyper.structure, hyper.imperfections], [DRAWN, K - DRAWN])
+        shared = np.vstack([problem()["directions"][k] * size for k in rest])
+        own_size = np.where(np.arange(OWN) < STARTS, hyper.starts, 1.0)
+        own = block_diag(*(problem()["own"][k] * own_size for k in rest))
+        cov = block_diag(*(blocks()[CHANNELS * k + c] for k in rest for c in range(CHANNELS)))
+        inverse = np.linalg.inv(cov + shared @ shared.T + own @ own.T)
+        x, y = (np.vstack([problem()[n][k] for k in rest]) for n in ("model", "target"))
+        z = np.linalg.solve(x.T @ inverse @ x + np.eye(P) / hyper.values**2, x.T @ inverse @ y)[:, 0]
+        np.testing.assert_allclose(marginal().level(hyper).optimum(grams("model", "target"), b), z)
+
+
+@pytest.mark.parametrize("begin", [Hyper(), Hyper(8.0, 1.0, 1.0, 4.0), Hyper(0.0, 0.0, 0.1, 1.0)], ids=str)
+def test_the_climb_to_the_likeliest_sizes_never_ends_below_its_start_nor_beside_a_higher_neighbour(
+    begin: Hyper,
+) -> None:
+    own = grams("model", "target")
+    best, most = marginal().likeliest(own, begin)
+    assert most == marginal().level(best).log_evidence(own) >= marginal().level(begin).log_evidence(own)
+    assert all(marginal().level(h).log_evidence(own) <= most for h in best.near())
+
+
+def test_a_step_of_the_grid_is_one_size_further_and_ends_with_it() -> None:
+    grids = (POLICY.structure_scales, POLICY.imperfection_scales, POLICY.start_scales, POLICY.value_scales)
+    low, high = (Hyper(*(grid[end] for grid in grids)) for end in (0, -1))
+    names = ("structure", "imperfections", "starts", "values")
+    assert set(low.near()) == {replace(low, **{n: grid[1]}) for n, grid in zip(names, grids, strict=True)}
+    assert set(high.near()) == {replace(high, **{n: grid[-2]}) for n, grid in zip(names, grids, strict=True)}
+    assert len(set(Hyper(*(grid[1] for grid in grids)).near())) == 8
+
+
+@every_hyper
+def test_what_is_left_is_least(hyper: Hyper) -> None:
+    level, x, own = marginal().level(hyper), columns("model", "target"), grams("model", "target")
+    z = level.optimum(own)
+
+    def cost(z: Array) -> float:
+        """Twice the negative log posterior of directions, own unknowns and z, but for a constant."""
+        c = level.reduced(own)
+        return float(c[-1, -1] - 2.0 * z @ c[:-1, -1] + z @ (c[:-1, :-1] + level.prior * np.eye(P)) @ z)
+
+    assert all(cost(z) < cost(z + 0.1 * move) for move in (*np.eye(P), *-np.eye(P)))
+    left = level.leftover(x, z, own)
+    size = np.repeat([hyper.structure, hyper.imperfections], [DRAWN, K - DRAWN])
+    own_size = np.where(np.arange(OWN) < STARTS, hyper.starts, 1.0)
+    along = np.vstack([d * size for d in marginal().along])
+    every = np.hstack([along, block_diag(*(n * own_size for n in marginal().own))])
+    aim = np.concatenate([r @ np.append(-z, 1.0) for r in x])
+    taken = np.linalg.solve(every.T @ every + np.eye(every.shape[1]), every.T @ aim)
+    np.testing.assert_allclose(np.concatenate(left), aim - every @ taken)
 
 
 def test_a_draw_is_alone_in_what_no_other_shows() -> None:

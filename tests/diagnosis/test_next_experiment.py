@@ -21,7 +21,7 @@ from diagnosis.next_experiment.foreseen import AlternativeModel, begun, foreseen
 from diagnosis.next_experiment.menu import Run, menu
 from diagnosis.next_experiment.proposal import COLUMNS, NOTHING, Proposal, next_experiment, revealing_run
 from diagnosis.policy import POLICY
-from diagnosis.search.claims import Round
+from diagnosis.search.claims import Round, figures
 from diagnosis.search.search import Search
 from tests.diagnosis.concealed import chain, empty
 from tests.twin.machines import machine
@@ -49,7 +49,7 @@ def state_of(of: Machine, batches: Sequence[Batch], reweight: bool = True) -> tu
 
 def fitted(of: Machine, batches: Sequence[Batch]) -> Fitted:
     problem, state = state_of(of, batches)
-    return calibrated(Point(of, twin_part(of), tuple(batches), problem, state.z, state.nuisance), state.noise)
+    return calibrated(Point(of, twin_part(of), tuple(batches), problem, state.z, state.nuisance, 0.0), state.noise)
 
 
 @cache
@@ -201,7 +201,7 @@ def test_what_a_claim_lacks_decides_how_much_a_run_must_bring() -> None:
     assert next_experiment(alternatives, lacking_nats={"loss": -3.0}).label == little.label
 
 
-def unclaimed(*gains: float, threshold: float = 60.0, accepted: bool = False) -> Search:
+def unclaimed(*gains: float, accepted: bool = False) -> Search:
     """A search whose last round tried the effect of a machine, by so many nats each, in clusters of their own."""
     before, after = tied()["loss"], tied()["air"]
     part = after.part.mechanisms["spin"]
@@ -210,14 +210,18 @@ def unclaimed(*gains: float, threshold: float = 60.0, accepted: bool = False) ->
         c = Candidate("rotating_convection", Where("link", "shaft-room"), f"spin{k}", f"spin {k}", part)
         tried.append(Tried(Scored(c), after, gain, np.full(4, gain / 4), f"c{k}", 0.0))
     screen: Any = None
-    null = threshold + np.array([-1e-9, 1e-9])
-    return Search(before, before, (Round(before, screen, tuple(tried), null, 0.0, accepted),))
+    last = Round(before, screen, tuple(tried))  # without figures nothing is claimed
+    if accepted:  # t_head shows what is impossible without the first
+        last = replace(last, figures=figures(before, tried), resolved=frozenset({"t_head"}))
+    return Search(before, before, (last,))
 
 
 def test_a_run_is_proposed_for_what_gains_too_little() -> None:
-    run = revealing_run(unclaimed(20.0))
+    tried = unclaimed(6.0)
+    run = revealing_run(tried)
     assert run is not None and run.separates == (NOTHING, "spin 0") and run.plan_text
-    alone = next_experiment({NOTHING: tied()["loss"], "spin 0": tied()["air"]}, lacking_nats={"spin 0": 40.0})
+    lacks = tried.rounds[-1].threshold - 6.0
+    alone = next_experiment({NOTHING: tied()["loss"], "spin 0": tied()["air"]}, lacking_nats={"spin 0": lacks})
     assert run.label == alone.label and run.nats == pytest.approx(alone.nats)
 
 

@@ -10,10 +10,11 @@ import pytest
 
 from data.batch import Batch, Finding
 from data.errors import InputError
-from diagnosis.fitting.batches import enough_batches, usable_batches
+from diagnosis.fitting.batches import coarse, enough_batches, spacing_s, usable_batches
 from diagnosis.fitting.fitted import baseline
 from diagnosis.policy import POLICY
 from tests.diagnosis.small_cases import runs, two_bodies
+from tests.twin.recordings import empty_batches
 from twin.compile import compile_network
 from twin.schema import twin_part
 from twin.simulation.inputs import inputs_of
@@ -125,3 +126,46 @@ def test_where_few_are_left_the_first_hole_is_told() -> None:
         given = [with_hole(b) if k < holes else b for k, b in enumerate(every)]
         with pytest.raises(InputError, match=f"^batch {every[0].batch_id}: channel 'room' has no value from "):
             usable_batches(compile_network(known), given)
+
+
+# Rows that are fitted
+
+
+def fine() -> list[Batch]:
+    """A run of 4 h with a row a minute whose speed changes at any row."""
+    (b,) = empty_batches(two_bodies(), 1, step_s=60.0)
+    rng = np.random.default_rng(0)
+    return [replace(b, table=b.table.assign(rpm=1000.0 * rng.integers(0, 5, b.n_rows)))]
+
+
+def test_thinned_rows_show_what_they_did_and_between_them_the_mean_acts() -> None:
+    (given,), (thin,) = fine(), coarse(fine(), 300.0)
+    assert thin.n_rows == 49 and thin.step_s == 300.0
+    pd.testing.assert_frame_equal(thin.table, given.table.iloc[::5].reset_index(drop=True))
+    inputs = inputs_of(compile_network(two_bodies()), [thin])
+    np.testing.assert_allclose(inputs.drivers["rpm"][0], given.values("rpm")[:-1].reshape(48, 5).mean(axis=1))
+    np.testing.assert_array_equal(inputs.at_rows["rpm"][0], given.values("rpm")[::5])
+
+
+@pytest.mark.parametrize("lead_rows", [0.5, 1.0])
+def test_with_a_lead_the_mean_is_that_of_what_acted_on_the_rows_as_given(lead_rows: float) -> None:
+    (given,), (thin,) = fine(), coarse(fine(), 300.0, lead_rows)
+    rpm = given.values("rpm")
+    acted = (1.0 - lead_rows) * rpm[:-1] + lead_rows * rpm[1:]
+    np.testing.assert_allclose(thin.held["rpm"][:-1], acted.reshape(48, 5).mean(axis=1))
+    np.testing.assert_array_equal(thin.values("rpm"), rpm[::5])
+
+
+def test_rows_that_are_far_apart_already_stay() -> None:
+    (b,) = given = empty_batches(two_bodies(), 1)
+    (same,) = coarse(given, 300.0)
+    assert same is b and not same.held
+    (led,) = coarse(given, 300.0, 1.0)
+    assert led.table is b.table
+    np.testing.assert_array_equal(led.held["rpm"], np.append(b.values("rpm")[1:], b.values("rpm")[-1]))
+
+
+def test_spacing_leaves_rows_enough_of_a_short_run() -> None:
+    assert spacing_s(fine()) == 241 * 60.0 / POLICY.min_rows_per_batch
+    assert spacing_s(empty_batches(two_bodies(), 1, hours=8.0)) == 300.0
+    assert spacing_s(empty_batches(two_bodies(), 1, hours=0.1, step_s=5.0)) == 73 * 5.0 / POLICY.min_rows_per_batch

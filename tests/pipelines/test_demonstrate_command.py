@@ -1,4 +1,4 @@
-"""`thermodrift demonstrate`: four lines, one page, one JSON document; the seed is today's date."""
+"""`thermodrift demonstrate`: four lines, one page, one JSON document."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from data.machine import Machine
 from diagnosis.result import Diagnosis
 from evidence.demonstration import demonstrating
-from pipelines.commands.demonstrate import today_seed
+from pipelines.commands.demonstrate import FIXED_SEED, seed_of
 from plants.sample import concealed
 from reports.diagnosis.page import write_diagnosis_report
 from tests.toys.command import Call, in_process
@@ -62,11 +62,12 @@ def test_json_is_one_document(call: Call, tmp_path: Path) -> None:
 def test_bad_input_is_one_line(call: Call, tmp_path: Path) -> None:
     done = call("demonstrate", "--seed", -3)
     assert (done.code, done.out) == (2, "")
-    assert done.err.strip() == "thermodrift: demonstration: seed: got -3, expected 0 or more; choose another number"
+    assert done.err.strip() == "thermodrift: --seed: got '-3', expected a whole number from 0, or \"today\""
     (tmp_path / "file").write_text("")
     done = call("demonstrate", "--seed", 1, "--out", tmp_path / "file")
     assert done.code == 2 and "is a file, expected a folder; give another --out" in done.err
 
 
-def test_the_seed_is_todays_date() -> None:
-    assert today_seed() == int(date.today().isoformat().replace("-", ""))
+def test_the_seed_is_fixed_unless_today_draws_it() -> None:
+    assert seed_of(str(FIXED_SEED)) == FIXED_SEED and seed_of("3") == 3
+    assert seed_of("today") == int(date.today().isoformat().replace("-", ""))

@@ -133,16 +133,12 @@ def test_where_and_when_is_pale_within_chance() -> None:
     assert {"by run", "unexplained heat", "bed", "W"} <= set(texts(fig))
 
 
-def test_the_null_shows_threshold_and_steps_and_the_flux_its_band() -> None:
+def test_a_missing_flux_shows_its_band_on_one_scale() -> None:
     t = toy_diagnosis("unlisted").tables
-    said = texts(diagnosis_evidence.null_gains(t["null"], t["steps"], True))
-    assert {"threshold 31", "step 1, rejected", "step 2, accepted", "gain in left-out log score, nats"} <= set(said)
     fig = diagnosis_evidence.missing_flux(t["flux"], True)
     assert len(fig.axes) == 6 and {"column_back, W", BATCHES[5], "time, h"} <= set(texts(fig))
     band = fig.axes[0].collections[0].get_paths()[0].get_extents()
     assert band.y1 > float(t["flux"]["value"][:73].max()) + 8 and fig.axes[0].get_ylim() == fig.axes[5].get_ylim()
-    few = texts(diagnosis_evidence.null_gains(t["null"][:0], t["steps"], True))
-    assert "Gains that structure alone gives: 0 refined twins with nothing missing" in few
 
 
 def test_names_with_dollars_and_many_runs_are_drawn() -> None:

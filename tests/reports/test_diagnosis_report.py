@@ -139,7 +139,7 @@ def test_tied_causes_name_the_run_that_settles_them() -> None:
 def test_simulated_and_drafted_are_said(full: str, folder: Path) -> None:
     assert "not in the library (SIMULATED)</title>" in full and '<span class="badge">SIMULATED</span></p>' in full
     pictures = re.findall(r'<img[^>]* alt="([^"]*)"', full)
-    assert len(pictures) == 9 and all(p.endswith("(SIMULATED)") for p in pictures)
+    assert len(pictures) == 8 and all(p.endswith("(SIMULATED)") for p in pictures)
     captions = re.findall(r'<p class="caption">(.*?)</p>', full)
     assert captions and all(c.endswith('<span class="badge">SIMULATED</span>') for c in captions)
     real = replace(toy_diagnosis("explained"), simulated=False, drafted=True)
@@ -152,7 +152,7 @@ def test_simulated_and_drafted_are_said(full: str, folder: Path) -> None:
 def test_every_picture_can_be_read(full: str) -> None:
     sources = re.findall(r'src="data:image/([^;]+);base64,([^"]+)"', full)
     kinds = [kind for kind, _ in sources]
-    assert kinds.count("svg+xml") == 1 and kinds.count("png") == 8
+    assert kinds.count("svg+xml") == 1 and kinds.count("png") == 7
     for kind, content in sources:
         raw = base64.b64decode(content)
         if kind == "png":
@@ -288,7 +288,7 @@ def test_limits_and_steps_have_their_units() -> None:
     )  # fmt: skip
     assert limits.rows[3].cells[1:] == ("0.04 K/h", "20 %", "–")
     assert [r.cells[-1] for r in diagnosis_tables.steps(t["steps"], True).rows] == ["accepted", "rejected"]
-    assert diagnosis_tables.steps(t["steps"], True).rows[0].cells[2:5] == ("+412", "31", "62 %")
+    assert diagnosis_tables.steps(t["steps"], True).rows[0].cells[2:5] == ("+412", "31", "97 %")
 
 
 def test_the_runs_of_every_channel_are_in_a_table() -> None:

@@ -70,4 +70,4 @@ def stored(verdict: str = "explained", *found: dict[str, Any], **changes: Any) -
 
 def truth(*visible: bool, error_true: float = 1.0) -> TrueModel:
     n = len(visible)
-    return TrueModel(3.5, error_true, 1.0, (50.0,) * n, (10.0,) * n, (40.0,) * n, visible, ((80.0, 60.0, 110.0),) * n)
+    return TrueModel(3.5, error_true, 1.0, (50.0,) * n, (40.0,) * n, visible, ((80.0, 60.0, 110.0),) * n)

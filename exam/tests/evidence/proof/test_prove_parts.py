@@ -42,7 +42,7 @@ def test_a_sealed_suite_has_a_secret_of_its_own(tmp_path: Path) -> None:
 
 
 def test_a_true_model_is_kept_as_it_is() -> None:
-    truth = TrueModel(3.0, math.nan, 1.0, (7.5, math.nan), (2.0, 3.0), (4.0, math.nan), (True, None),
+    truth = TrueModel(3.0, math.nan, 1.0, (7.5, math.nan), (4.0, math.nan), (True, None),
                       ((50.0, 40.0, 60.0), (None, None, None)))  # fmt: skip
     back = truth_from_json(plain_json(vars(truth)))
     assert back is not None and repr(back) == repr(truth)

@@ -50,7 +50,7 @@ def test_a_floor_of_the_twins_own_law_is_explained_down_to_the_noise() -> None:
     assert got.error_before > 2.0 * got.error_true
     assert 0.7 < got.error_true < 1.3
     assert got.error_floor == 1.0
-    assert got.gain_nats[0] > got.bar_nats[0] >= got.threshold_nats[0] > 0
+    assert got.gain_nats[0] > got.bar_nats[0] == VISIBLE_NATS
     ((size, low, high),) = got.sizes
     assert size == pytest.approx(8.0, rel=0.1) and low is not None and high is not None and low < 8.0 < high
 
