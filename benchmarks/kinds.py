@@ -87,7 +87,9 @@ def examined(
             row["cpu_s"] = round(time.process_time() - begun, 1)
             row["proposed"] = list(_proposed(done, case.machine, batches, answer["redraw"], key, proposed))
             if what in ("one", "two") and truth:
-                row |= _visible(true_model(case.machine, batches, answer))
+                row |= _visible(
+                    true_model(case.machine, batches, answer, done.search.baseline if done.search else None)
+                )
     except (InputError, WorkError) as error:
         row["trouble"] = str(error)
     path.write_text(json.dumps(row, default=float))

@@ -157,14 +157,17 @@ class TrueModel:
 
 
 @threadpool_limits.wrap(limits=1)
-def true_model(machine: Machine, batches: Sequence[Batch], answer: Mapping[str, Any]) -> TrueModel:
-    """The true model of an opened case; `answer` is the key as the vault's JSON gives it.
+def true_model(
+    machine: Machine, batches: Sequence[Batch], answer: Mapping[str, Any], fit: Fitted | None = None
+) -> TrueModel:
+    """The true model of an opened case; `answer` is the key as the vault's JSON gives it, `fit` the baseline of a
+    diagnosis of the same batches, where there is one.
 
     Raises:
         InputError: recordings or a machine file that cannot be used; WorkError: the machine file's model fails.
     """
     key = AnswerKey.from_json(answer)
-    fit = _fit(machine, batches)
+    fit = fit or _fit(machine, batches)
     level = _level(fit)
     if not key.terms:
         return TrueModel(level, level, 1.0, (), (), (), ())
