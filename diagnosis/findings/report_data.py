@@ -177,11 +177,16 @@ class Found:
         return tuple(p for p in own if p in fitted) or own[:1] or tuple(fitted[:1]) or tuple(self.parameters)[:1]
 
     @property
+    def alone(self) -> float:
+        """Its probability without those of the explanations that are alike."""
+        return max(0.0, self.probability - sum(o.probability for o in self.others if o.alike))
+
+    @property
     def tied(self) -> tuple[Other, ...]:
         """Explanations that these runs cannot distinguish from it and that are nearly as probable."""
-        if self.probability > POLICY.untied_probability:
+        if self.alone > POLICY.untied_probability:
             return ()
-        least = POLICY.alike_min_probability_share * self.probability
+        least = POLICY.alike_min_probability_share * self.alone
         return tuple(o for o in self.others if o.alike and o.probability >= least)
 
 

@@ -112,8 +112,7 @@ def claim_phrase(found: Found) -> str:
     """What is missing, where and how much, without a full stop; the first letter is a capital."""
     if found.tied:
         # what is claimed may be the less likely: a likelier one that looks alike may fail a criterion
-        alone = found.probability - sum(o.probability for o in found.others if o.alike)
-        own = (alone, f"{effect_phrase(found)}{_size(found)} ({percent(alone)})")
+        own = (found.alone, f"{effect_phrase(found)}{_size(found)} ({percent(found.alone)})")
         tied = [(o.probability, f"{_other_phrase(o)} ({percent(o.probability)})") for o in found.tied]
         said = [text for _, text in sorted([own, *tied], key=lambda s: -s[0])]
         numbers = {2: "two", 3: "three", 4: "four"}
@@ -174,7 +173,7 @@ def verdict_statement(
         separates: the run that would distinguish the explanations `possible`, or show whether they hold.
     """
     # of several effects each says by itself how sure it is, and what may be in its place
-    doubts = [_doubt(f) if len(found) > 1 else "" for f in found]
+    doubts = [_doubt(f) if len(found) > 1 else _instead(f) for f in found]
     said = listed(
         [
             effect_phrase(f) + ("" if f.kind.is_unlisted else _size(f)) + doubt
@@ -319,6 +318,11 @@ def _doubt(found: Found) -> str:
         return ""
     tied = [f"{_other_phrase(o)}, {percent(o.probability)}" for o in found.tied]
     return f" ({percent(found.probability)}{''.join(f'; or {text}' for text in tied)})"
+
+
+def _instead(found: Found) -> str:
+    """``, or radiation at the bed``: what these runs cannot distinguish from an effect."""
+    return f", or {listed([_other_phrase(o) for o in found.tied], 'or')}" if found.tied else ""
 
 
 def _other_phrase(other: Other) -> str:

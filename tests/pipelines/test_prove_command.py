@@ -41,7 +41,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def true(machine: object, batches: object, key: dict[str, object]) -> tuple[TrueModel, str]:
         n = len(key["terms"])  # type: ignore[arg-type]
         sizes = ((None, None, None),) * n
-        return TrueModel(2.0, 1.0, 1.0, (float("nan"),) * n, (5.0,) * n, (9.0,) * n, (True,) * n, sizes), ""
+        return TrueModel(2.0, 1.0, 1.0, (float("nan"),) * n, (9.0,) * n, (True,) * n, sizes), ""
 
     monkeypatch.setattr(running, "examine", examine)
     monkeypatch.setattr(proof_judging, "_true", true)

@@ -104,9 +104,9 @@ def _second_heater(twin: Mapping[str, Any], batches: list[Batch]) -> Term:
 # The cell: its lost voltage heats it, its charge makes it grow.
 NEUTRAL_V = (4.113, 4.056, 3.938, 3.827, 3.712, 3.646, 3.507, 3.233)
 STRAIN_UM_PER_M = (
-    -101.6, -49.27, -99.87, -181.9, -246.2, -263.3, -232.6, -195.0, -144.4, -74.93, -23.54, 2.359,
+    -101.1, -48.58, -99.84, -182.1, -246.2, -263.3, -232.6, -195.0, -144.4, -74.97, -23.55, 2.443,
 )  # fmt: skip
-STRAIN_UM_PER_M_K = (15.92, 7.513, -1.334, -3.936, -5.299)
+STRAIN_UM_PER_M_K = (15.45, 7.500, -1.334, -3.936, -5.299)
 CELL: Mapping[str, float] = MappingProxyType(
     {f"mechanisms.heat.u{k}": v for k, v in enumerate(NEUTRAL_V)}
     | {f"mechanisms.growth.f{k}": v for k, v in enumerate(STRAIN_UM_PER_M, 1)}
