@@ -263,12 +263,12 @@ class Fitted(Point):
     def own(self) -> list[Array]:
         """Each batch's unknowns by least squares under the covariance's blocks: a start is no structure."""
         white, blocks = self.marginal.covariance.white, self.problem.linearise(self.x, self.nuisance)
-        starts, spread = len(self.problem.nuisances.start_K), self.hyper.starts  # an effect may add a body
-        out = []
-        for k, (block, v) in enumerate(zip(blocks, self.nuisance, strict=True)):
-            size = np.where(np.arange(len(v)) < starts, spread, 1.0)
-            out.append(v + own_step(white(k, block.nuisance), v, white(k, block.residual), size))
-        return out
+        starts = len(self.problem.nuisances.start_K)  # an effect may add a body to those of the marginal
+        every = enumerate(zip(blocks, self.nuisance, strict=True))
+        return [
+            v + own_step(white(k, b.nuisance), v, white(k, b.residual), self.hyper.own_sizes(len(v), starts))
+            for k, (b, v) in every
+        ]
 
     @cached_property
     def noise(self) -> Noise:

@@ -155,7 +155,8 @@ def _diagnosis(
     worse = {} if drafted else worsened(rows_as_given(on_all_rows(done.baseline, batches)), left_out_rows(full))
     if worse:
         remarks += (f"the machine file keeps its values and parts: the fitted ones raise {made.rises(worse, units)}",)
-    harmful = [r.best.candidate.label for r in named if r.best is not None and harms(left_out_rows(r.before), after)]
+    pairs = [(r, left_out_rows(r.before)) for r in named]  # each effect, and what is left with all the others
+    harmful = [r.best.candidate.label for r, left in pairs if r.best is not None and harms(left, after)]
     remarks += tuple(
         f"{label}: named, and kept out of the machine file: simulated alone, runs left out are predicted worse with it"
         for label in harmful
@@ -163,8 +164,8 @@ def _diagnosis(
     run = settling_run(named)
     separates = run.label if run is not None else ""
     found = []
-    for r in named:
-        own_rms = rms_of(made.rms_table(left_out_rows(r.before), after, final), final)
+    for r, left in pairs:
+        own_rms = rms_of(made.rms_table(left, after, final), final)
         one = found_of(done, r, part_after, intervals, own_rms, separates)
         if one.kind.is_unlisted and r.best is not None:
             one = unlisted_found(one, r.forms[r.best.candidate.name], final, r.best.candidate, intervals)

@@ -67,7 +67,6 @@ class Covariance:
     drawn: int = 0  # how many of the directions, the first ones, were drawn; the others are imperfections
     structure: Structure | None = None
     share: float = 0.0  # of what draws alone show
-    factor: Array | None = None  # of each channel's (C,) block sd
 
     @classmethod
     def of(cls, problem: CalibrationProblem, block: Callable[[int, int, slice], Array], **given: Any) -> Covariance:
@@ -101,7 +100,7 @@ class Covariance:
     def scaled(self, factor: Array) -> Covariance:
         """The same with each channel's (C,) block sd times a factor."""
         roots = tuple({c: root / factor[c] for c, root in own.items()} for own in self.roots)
-        return replace(self, roots=roots, factor=factor if self.factor is None else self.factor * factor)
+        return replace(self, roots=roots)
 
 
 def _inverse_root(block: Array) -> Array:

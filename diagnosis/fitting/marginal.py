@@ -24,7 +24,7 @@ TINY = 1e-300
 
 @dataclass(frozen=True)
 class Hyper:
-    """Sizes of what is integrated out: of refined twins' structure, of imperfections, of the bodies' starts.
+    """Sizes of what is integrated out: structure of refined twins, imperfections, starts of bodies, values of the file.
 
     Factors on what was drawn, on the policy's sd, on the machine file's `initial_spread` and on the spreads of its
     values: those of lumps are effective ones, which a drawing does not state.
@@ -34,6 +34,10 @@ class Hyper:
     imperfections: float = 1.0
     starts: float = 1.0
     values: float = 1.0
+
+    def own_sizes(self, count: int, starts: int) -> Array:
+        """Prior sd (count,) of a batch's own unknowns, of which the first are `starts` of bodies."""
+        return np.where(np.arange(count) < starts, self.starts, 1.0)
 
     def near(self) -> Iterator[Hyper]:
         """Those one step of the grid away, one size at a time."""
@@ -149,7 +153,7 @@ class Level:
         size[: covariance.drawn], size[covariance.drawn :] = hyper.structure, hyper.imperfections
         self.prior = 1.0 / hyper.values**2  # precision of the model's parameters z
         self.size = size
-        self.own_size = [np.where(np.arange(len(n)) < of.starts, hyper.starts, 1.0) for n in of.own_own]
+        self.own_size = [hyper.own_sizes(len(n), of.starts) for n in of.own_own]
         self._root = [
             np.linalg.cholesky(n * s * s[:, None] + np.eye(len(n)))
             for n, s in zip(of.own_own, self.own_size, strict=True)

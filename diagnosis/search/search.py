@@ -66,10 +66,12 @@ def _judged_together(
             continue  # the effects as they were grown explain more
         rounds[k] = done
         full = done.best.fitted if done.best is not None else done.before
+    if not any(r.accepted for r in rounds):
+        return rounds, baseline
     for k in grown:
         if not rounds[k].accepted:
-            full = rounds[k].before if len(grown) == 1 else _less(full, rounds[k], baseline)
-    return rounds, full if any(r.accepted for r in rounds) else baseline
+            full = _less(full, rounds[k], baseline)
+    return rounds, full
 
 
 def _less(fitted: Fitted, done: Round, baseline: Fitted) -> Fitted:

@@ -85,9 +85,9 @@ def test_figures_do_not_depend_on_how_long_was_recorded() -> None:
 
 def test_a_claim_is_more_probable_with_a_larger_gain_alone() -> None:
     gains = np.geomspace(1e-4, 10.0, 12)
-    told = [Figures(gain, -1.0, 0.3, 0.7).probability for gain in gains]
-    assert 0.0 < told[0] < 0.05 and 0.95 < told[-1] < 1.0 and (np.diff(told) > 0).all()
-    assert told == [Figures(gain, -9.0, -1.0, 0.0).probability for gain in gains]
+    probabilities = [Figures(gain, -1.0, 0.3, 0.7).probability for gain in gains]
+    assert 0.0 < probabilities[0] < 0.05 and 0.95 < probabilities[-1] < 1.0 and (np.diff(probabilities) > 0).all()
+    assert probabilities == [Figures(gain, -9.0, -1.0, 0.0).probability for gain in gains]
 
 
 def test_from_the_least_relative_gain_on_a_claim_is_made() -> None:

@@ -74,8 +74,8 @@ def test_an_alternative_of_an_older_file_is_not_alike() -> None:
     older = changed(findings=[RAW["findings"][0] | {"alternatives": [plain]}])
     (now,), (then,) = (Findings.from_json(raw).findings[0].alternatives for raw in (RAW, older))
     assert now.alike and not then.alike
-    told = json.loads(as_json(Findings.from_json(older)))["findings"][0]["alternatives"]
-    assert told == [plain | {"alike": False}]
+    alternatives = json.loads(as_json(Findings.from_json(older)))["findings"][0]["alternatives"]
+    assert alternatives == [plain | {"alike": False}]
 
 
 def test_a_file_reads_back_and_writes_the_same_text(tmp_path: Path) -> None:

@@ -93,5 +93,5 @@ def test_the_probability_of_a_claim_is_the_fit_to_the_stored_claims() -> None:
     x, right = np.log(np.maximum(stored[["relative_gain"]].to_numpy(), 1e-9)), stored["right"] == "yes"
     fit = LogisticRegression(C=1e6).fit(x, right)
     assert (POLICY.claim_offset, POLICY.claim_weight) == pytest.approx((fit.intercept_[0], fit.coef_[0, 0]), abs=0.01)
-    told = [Figures(gain, 0.0, 1.0, 1.0).probability for gain in stored["relative_gain"]]
-    assert np.mean(told) == pytest.approx(right.mean(), abs=0.01)
+    probabilities = [Figures(gain, 0.0, 1.0, 1.0).probability for gain in stored["relative_gain"]]
+    assert np.mean(probabilities) == pytest.approx(right.mean(), abs=0.01)
