@@ -56,8 +56,9 @@ from diagnosis.next_experiment.proposal import NOTHING, Proposal, revealing_run,
 from diagnosis.policy import POLICY
 from diagnosis.result import Diagnosis
 from diagnosis.screening.screen import limits
+from diagnosis.search.claims import Round
 from diagnosis.search.refits import Progress
-from diagnosis.search.search import Search, search, start_worker
+from diagnosis.search.search import Search, less, search, start_worker
 from twin.calibration.identifiability import Interval, intervals90
 from twin.calibration.least_squares import result
 from twin.calibration.recorder import lead_remarks
@@ -144,23 +145,27 @@ def _diagnosis(
     machine, final, named = done.baseline.machine, done.final, done.accepted
     before, after = left_out_rows(done.baseline), left_out_rows(final)
     full = on_all_rows(final, batches)
-    written = _intervals(plain(full))  # the file's twin simulates alone
-    intervals = {i.name: i for i in written}
+    intervals = {i.name: i for i in _intervals(plain(full))}
     rms_table = made.rms_table(before, after, final)
     rms = rms_of(rms_table, final)
     part_after = with_deviations(final)
     drafted, units = machine.twin is None, {r.channel: r.unit for r in rms}
     remarks += tuple(i.words for i in impossible(done.baseline))
     remarks += lead_remarks(machine, final.lead_rows)
-    worse = {} if drafted else worsened(rows_as_given(on_all_rows(done.baseline, batches)), left_out_rows(full))
+    pairs = [(r, left_out_rows(r.before)) for r in named]  # each effect, and what is left with all the others
+    harmful = [r for r, left in pairs if r.best is not None and harms(left, after)]
+    remarks += tuple(
+        f"{r.best.candidate.label}: named, and kept out of the machine file: simulated alone, runs left out are "
+        "predicted worse with it"
+        for r in harmful if r.best is not None
+    )  # fmt: skip
+    kept = _without(done, harmful)
+    written = full if kept is final else kept and on_all_rows(kept, batches)
+    worse = {}
+    if written is not None and not drafted:
+        worse = worsened(rows_as_given(on_all_rows(done.baseline, batches)), left_out_rows(written))
     if worse:
         remarks += (f"the machine file keeps its values and parts: the fitted ones raise {made.rises(worse, units)}",)
-    pairs = [(r, left_out_rows(r.before)) for r in named]  # each effect, and what is left with all the others
-    harmful = [r.best.candidate.label for r, left in pairs if r.best is not None and harms(left, after)]
-    remarks += tuple(
-        f"{label}: named, and kept out of the machine file: simulated alone, runs left out are predicted worse with it"
-        for label in harmful
-    )
     run = settling_run(named)
     separates = run.label if run is not None else ""
     found = []
@@ -201,12 +206,7 @@ def _diagnosis(
         **located,
     }
     simulated = any(b.simulated for b in final.batches)
-    new_file: dict[str, Any] = {
-        "values": {i.name: i.value for i in written},
-        "intervals": written,
-        "added": changed_parts(part, part_after),
-        "notes": _notes(findings, len(names)),
-    }
+    new_file = {} if worse or written is None else _new_file(part, written, findings, len(names))
     return Diagnosis(
         machine=machine,
         findings=Findings(
@@ -232,8 +232,29 @@ def _diagnosis(
         network=final.problem.network,
         plan_text=(run.plan_text or None) if run is not None else None,
         search=done,
-        **({} if worse or harmful else new_file),
+        **new_file,
     )
+
+
+def _without(done: Search, harmful: Sequence[Round]) -> Fitted | None:
+    """The final fit without these effects; None where no machine is without them."""
+    fitted = done.final
+    try:
+        for r in harmful:
+            fitted = less(fitted, r, done.baseline)
+    except (InputError, WorkError):
+        return None
+    return fitted
+
+
+def _new_file(part: TwinPart, written: Fitted, findings: Sequence[Finding], runs: int) -> dict[str, Any]:
+    """What `diagnosed_text` takes: values of the fit that simulates alone, parts, and notes on those that it has."""
+    intervals, added = _intervals(plain(written)), changed_parts(part, with_deviations(written))
+    notes = _notes(findings, runs)
+    return {
+        "values": {i.name: i.value for i in intervals}, "intervals": intervals, "added": added,
+        "notes": {name: note for name, note in notes.items() if name in written.part.mechanisms},
+    }  # fmt: skip
 
 
 def _intervals(fitted: Fitted) -> tuple[Interval, ...]:
@@ -248,7 +269,7 @@ def _per_batch(table: pd.DataFrame, column: str) -> pd.Series:
 
 
 def _detection_limits(table: pd.DataFrame) -> tuple[DetectionLimit, ...]:
-    """Every candidate's limit; nan where no amplitude within bounds would have been seen."""
+    """Every candidate's limit; nan where no amplitude within bounds would have been claimed."""
     return tuple(
         DetectionLimit(
             mechanism=mechanism, where=Place(kind=kind, name=name), words=words,

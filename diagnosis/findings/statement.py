@@ -211,8 +211,9 @@ def _open_question(run: str, possible: Sequence[str]) -> str:
 
 
 def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Sequence[str]) -> str:
+    largest = sorted(rms, key=lambda r: -r.times_noise)[:_MAX_NAMED]
     left = [f"{r.channel} {of_error(r.after, r.unit)}"
-            + (f" (noise {few(r.noise)})" if r.noise > 0 else "") for r in rms]  # fmt: skip
+            + (f" (noise {few(r.noise)})" if r.noise > 0 else "") for r in largest]  # fmt: skip
     worst = beyond_noise(rms)
     text = "Nothing is missing: the remaining error is the noise"
     if worst:
@@ -231,7 +232,7 @@ def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Se
     rest = len(limits) - len(seen)
     more = f" and {rest} more in the table of limits" if rest else ""
     return (
-        f"{text}. An effect above these limits would have been seen: {', '.join(seen)}{more}." if seen else f"{text}."
+        f"{text}. An effect above these limits would have been claimed: {', '.join(seen)}{more}." if seen else f"{text}."
     )
 
 

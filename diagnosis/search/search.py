@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from threadpoolctl import threadpool_limits
@@ -59,7 +60,7 @@ def _judged_together(
     full = rounds[grown[-1]].best.fitted if grown else baseline  # type: ignore[union-attr]
     for k in grown[:-1]:
         try:
-            done = one_round(_less(full, rounds[k], baseline), workers, tell, rounds[k].screen)
+            done = one_round(less(full, rounds[k], baseline), workers, tell, rounds[k].screen)
         except (InputError, WorkError):
             continue  # no machine is without it
         if done.best is not None and done.best.fitted.log_evidence < full.log_evidence - POLICY.telling_nats:
@@ -70,12 +71,17 @@ def _judged_together(
         return rounds, baseline
     for k in grown:
         if not rounds[k].accepted:
-            full = _less(full, rounds[k], baseline)
+            with suppress(InputError, WorkError):  # no machine is without it
+                full = less(full, rounds[k], baseline)
     return rounds, full
 
 
-def _less(fitted: Fitted, done: Round, baseline: Fitted) -> Fitted:
-    """The fit without the effect of a round."""
+def less(fitted: Fitted, done: Round, baseline: Fitted) -> Fitted:
+    """The fit without the effect of a round.
+
+    Raises:
+        InputError, WorkError: it cannot be simulated without.
+    """
     if done.best is None:
         return fitted
     return refitted(fitted, without(fitted.part, done.best.candidate, baseline.part))

@@ -127,6 +127,16 @@ def test_what_was_found_is_a_part_of_the_machine() -> None:
     assert done.part_before == twin_part(done.machine)
 
 
+def test_an_effect_that_harms_left_out_runs_is_named_and_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file has the values of a fit without it: recalibrated, nothing added, no value or note of the effect."""
+    monkeypatch.setattr("diagnosis.diagnose.harms", lambda before, after: True)
+    done = diagnose(*CASES["explained"]())
+    (found,) = done.findings.findings
+    assert found.mechanism == "sensor_drift" and any("kept out of the machine file" in r for r in done.remarks)
+    names = {p.name for p in compile_network(done.machine).parameters}
+    assert set(done.values) and set(done.values) <= names and not done.added and not done.notes
+
+
 @pytest.mark.parametrize("verdict", ["unlisted", LONGEST])
 def test_no_listed_mechanism_is_said_with_its_size(verdict: str) -> None:
     fluxes = [f for f in diagnosed(verdict).findings.findings if f.mechanism == "free_flux"]

@@ -202,11 +202,11 @@ def test_verdicts() -> None:
     after = (Rms("z", "um", 1.3, 1.3, 1.2),)
     assert verdict_statement("consistent", rms=after, limits=limits, places=["the bed"] * 6) == (
         "Nothing is missing: the remaining error is the noise (z 1.3 µm (noise 1.2)). An effect above these limits "
-        "would have been seen: heat to the floor at the bed 1.8 W/K, waste heat of a control cabinet or of auxiliaries "
+        "would have been claimed: heat to the floor at the bed 1.8 W/K, waste heat of a control cabinet or of auxiliaries "
         "at the bed 12 W, sunlight on one face at the bed 20 W/m² and 3 more in the table of limits."
     )
     assert verdict_statement("consistent", rms=after, limits=limits[:2], places=["the bed"] * 2).endswith(
-        "would have been seen: heat to the floor at the bed 1.8 W/K and 1 more in the table of limits."
+        "would have been claimed: heat to the floor at the bed 1.8 W/K and 1 more in the table of limits."
     )
     assert verdict_statement("consistent") == "Nothing is missing: the remaining error is the noise."
     more = "Too weak for a claim: heat to the floor: bed. A night switched off would show more."
@@ -218,13 +218,13 @@ def test_verdicts() -> None:
     coarse = (Rms("z", "um", 13.0, 13.0, 1.2), Rms("x", "um", 6.0, 6.0, 1.2), Rms("y", "um", 30.0, 30.0, 1.2))
     assert verdict_statement("consistent", rms=coarse) == (
         "No missing effect is supported by these runs; the remaining error, 11 times the noise in the median channel "
-        "and 25 times in y, is not explained: a network this coarse may leave as much (z 13 µm (noise 1.2), x 6.0 µm "
-        "(noise 1.2), y 30 µm (noise 1.2))."
+        "and 25 times in y, is not explained: a network this coarse may leave as much (y 30 µm (noise 1.2), z 13 µm "
+        "(noise 1.2), x 6.0 µm (noise 1.2))."
     )
     one = (*after, Rms("x", "um", 1.0, 1.1, 1.0), Rms("front", "degC", 0.35, 0.35, 0.03, sensor=True))
     assert verdict_statement("consistent", rms=one).startswith(
         "No missing effect is supported by these runs; the remaining error, 1.1 times the noise in the median channel "
-        "and 12 times in front, is not explained: a network this coarse may leave as much (z 1.3"
+        "and 12 times in front, is not explained: a network this coarse may leave as much (front 0.35"
     )
     assert verdict_statement("explained", [SINK], [Z]) == (
         "The difference is heat to the floor at the bed, 10 W/K (90 %: 9–12); with it the z error of runs left out of "

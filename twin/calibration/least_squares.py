@@ -203,15 +203,17 @@ def likelier(problem: Problem, one: State, other: State) -> State:
     Rows that count as one are those of the state whose residuals are less correlated, for both: each state's own would
     reward the smoother misfit.
     """
-    inflation = np.minimum(*(noise_left(problem, s).inflation for s in (one, other)))
-    return one if log_posterior(problem, one, inflation) >= log_posterior(problem, other, inflation) else other
+    noises = [noise_left(problem, s) for s in (one, other)]
+    inflation = np.minimum(*(n.inflation for n in noises))
+    level = [log_posterior(problem, s, n, inflation) for s, n in zip((one, other), noises, strict=True)]
+    return one if level[0] >= level[1] else other
 
 
-def log_posterior(problem: Problem, state: State, inflation: Array) -> float:
-    """Nats, up to a constant, when every channel's noise is unknown; so many rows (c,) of a channel count as one."""
+def log_posterior(problem: Problem, state: State, noise: Noise, inflation: Array) -> float:
+    """Nats, up to a constant, of a state under the noise that it leaves; so many rows (c,) of a channel count as one."""
     rows = np.bincount(np.concatenate(state.channels), minlength=len(problem.channels)) / inflation
     priors = float(state.z @ state.z) + sum(float(v @ v) for v in state.nuisance)
-    return -0.5 * (priors + float(np.sum(rows * np.log(noise_left(problem, state).factor ** 2))))
+    return -0.5 * (priors + float(np.sum(rows * np.log(noise.factor**2))))
 
 
 SAME_COST = 1e-3  # starts whose costs differ by less, and which lie together, have reached the same optimum

@@ -33,20 +33,32 @@ def settled_with_lead(
     Returns:
         The lead in rows, its problem, and what `settled` returns for it.
     """
-    stated = machine.recording.drivers
-    held = problem_at(LEAD_ROWS[stated or "held"])
+    first_rows = first_lead_rows(machine)
+    held = problem_at(first_rows)
     state, notes = settled(held, options, progress, noise)
-    best = LEAD_ROWS[stated or "held"], held, state, notes
-    if stated or not held.network.drivers or not any(np.ptp(v) for v in held.inputs.drivers.values()):
+    best = first_rows, held, state, notes
+    if not must_learn_lead(machine, held):
         return best
-    inflation = noise_left(held, state).inflation
-    most = log_posterior(held, state, inflation)
+    noise_held = noise_left(held, state)
+    most = log_posterior(held, state, noise_held, noise_held.inflation)
     for lead_rows in sorted(LEAD_ROWS.values())[1:]:
         problem = problem_at(lead_rows)
         state, notes = settled(problem, options, progress, noise)
-        if (level := log_posterior(problem, state, inflation)) > most:
+        level = log_posterior(problem, state, noise_left(problem, state), noise_held.inflation)
+        if level > most:
             best, most = (lead_rows, problem, state, notes), level
     return best
+
+
+def first_lead_rows(machine: Machine) -> float:
+    """The lead that the machine file states, or that of drivers held from their row on."""
+    return LEAD_ROWS[machine.recording.drivers or "held"]
+
+
+def must_learn_lead(machine: Machine, held: CalibrationProblem) -> bool:
+    """Whether the machine file leaves open when drivers act, and one of them moves."""
+    moves = any(np.ptp(v) for v in held.inputs.drivers.values())
+    return machine.recording.drivers is None and bool(held.network.drivers) and moves
 
 
 def lead_remarks(machine: Machine, lead_rows: float) -> tuple[str, ...]:
