@@ -20,7 +20,6 @@ QUIET = {
     "GIT_PYTHON_REFRESH": "quiet",
     "PREFECT_LOGGING_LEVEL": "WARNING",
     "PREFECT_SERVER_LOGGING_LEVEL": "ERROR",
-    "PREFECT_LOGGING_TO_API_WHEN_MISSING_FLOW": "ignore",
 }
 # How long a request to a tracking server is tried: about 10 s where it refuses. MLflow itself goes on for minutes.
 PATIENCE = {

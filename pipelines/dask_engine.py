@@ -2,8 +2,7 @@
 
 The cut is a job of the grid: one family of one error channel, a pure function of the crossings, which travel to the
 workers once. So a worker needs this program and its libraries, and neither the lake, the store nor Prefect's server;
-what is finished is checkpointed here. A worker that ends loses its jobs to the others. Task runners of Prefect would
-send all steps with all their data to the workers instead.
+what is finished is checkpointed here. A worker that ends loses its jobs to the others.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ LOST = 3  # times that a job is sent again because all workers that held its dat
 
 
 class DaskEngine:
-    """Trainings as Prefect flows whose grid is computed by Dask workers.
+    """Trainings as flow runs of Prefect whose grid is computed by Dask workers.
 
     Args:
         address: of a scheduler, such as tcp://host:8786; None starts one on this computer, on 127.0.0.1.
@@ -56,9 +55,9 @@ class DaskEngine:
     def __init__(self, address: str | None = None, workers: int = 0) -> None:
         if address is not None and "://" not in address:
             raise InputError(f"--address: got {address!r}, expected that of a Dask scheduler, such as tcp://host:8786")
-        from pipelines.prefect_server import start_server
+        from pipelines.prefect_reports import Reports
 
-        self._address, self._workers, self._server = address, workers or LANES, start_server()
+        self._address, self._workers, self._reports = address, workers or LANES, Reports()
 
     def train(
         self, request: TrainRequest, settings: Settings, say: Say = lambda text: None, done: Done | None = None
@@ -72,7 +71,7 @@ class DaskEngine:
 
         with Cluster(self._address, self._workers) as cluster:
             say(f"Dask cluster {cluster.name}: {cluster.n} workers")
-            return train_in_flow(request, settings, say, done, self._server, cluster.pools, max(LANES, cluster.n))
+            return train_in_flow(request, settings, say, done, self._reports, cluster.pools, max(LANES, cluster.n))
 
 
 class Cluster:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 ENGINES = Registry(
     "engine",
     {
-        "prefect": "pipelines.prefect_server:PrefectEngine",
+        "prefect": "pipelines.engine:PrefectEngine",
         "direct": "pipelines.engine:DirectEngine",
         "dask": "pipelines.dask_engine:DaskEngine",
     },
@@ -52,6 +52,25 @@ class DirectEngine:
         from pipelines.jobs.training import train
 
         return train(request, settings, DirectCaller(done), say)
+
+
+class PrefectEngine:
+    """Plain calls as well, reported to the Prefect server that PREFECT_API_URL names, else to a temporary one."""
+
+    def __init__(self, address: str | None = None) -> None:
+        if address is not None:
+            raise no_address("prefect")
+        from pipelines.prefect_reports import Reports
+
+        self._reports = Reports()
+
+    def train(
+        self, request: TrainRequest, settings: Settings, say: Say = lambda text: None, done: Done | None = None
+    ) -> TrainOutcome:
+        """See `Engine`."""
+        from pipelines.flows import train_in_flow
+
+        return train_in_flow(request, settings, say, done, self._reports)
 
 
 def open_engine(key: str, address: str | None = None) -> Engine:

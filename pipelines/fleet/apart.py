@@ -13,14 +13,14 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-from uuid import UUID
 
 from data.errors import InputError, WorkError
 from data.files import write_atomic
 from pipelines import stopping
-from pipelines.fleet.fleet_file import Fleet, FleetMachine
+from pipelines.fleet.fleet_file import Fleet
 
 
 def check(fleet: Fleet) -> dict[str, Any]:
@@ -51,44 +51,24 @@ def check(fleet: Fleet) -> dict[str, Any]:
 def _schema() -> dict[str, Any]:
     from prefect.utilities.callables import parameter_schema
 
+    from pipelines.jobs.request import request_for
+
+    return parameter_schema(request_for).model_dump()
+
+
+def run(parameters: Mapping[str, Any], scheduled: str | None) -> dict[str, Any]:
+    """One retraining, reported as the run that a server scheduled or as a new one: `ok` and `summary`."""
+    from pipelines.prefect_reports import Reports
+
+    reports = Reports()  # comes up while the rest is imported
     from pipelines.fleet.retraining import retrain
 
-    return parameter_schema(retrain).model_dump()
-
-
-def run(machine: FleetMachine, flow_run_id: str | None) -> dict[str, Any]:
-    """One retraining, as a run that a server scheduled or on a temporary server: `ok` and `summary`."""
-    from pipelines.prefect_server import start_server
-
-    starting = start_server() if flow_run_id is None else None  # comes up while the rest is imported
-    from pipelines.fleet.retraining import finished, retrain
-
     try:
-        if flow_run_id is not None:
-            _run_scheduled(UUID(flow_run_id))
-        else:
-            if starting is not None:
-                starting.join()
-            retrain(**machine.parameters)
+        return {"ok": True, "summary": retrain(**parameters, reports=reports, scheduled=scheduled)}
     except (InputError, WorkError) as error:
         return {"ok": False, "summary": str(error)}
     except Exception as error:
-        said = f"{type(error).__name__}: {' '.join(str(error).split())}"[:300]
-        if finished:  # the training is stored and promoted
-            return {"ok": True, "summary": f"{finished[-1]}; its end could not be reported to Prefect ({said})"}
-        return {"ok": False, "summary": said}
-    return {"ok": True, "summary": finished[-1]}
-
-
-def _run_scheduled(flow_run_id: UUID) -> None:
-    from prefect.client.orchestration import get_client
-    from prefect.flow_engine import run_flow
-
-    from pipelines.fleet.retraining import retrain
-
-    with get_client(sync_client=True) as client:
-        flow_run = client.read_flow_run(flow_run_id)
-    run_flow(retrain, flow_run=flow_run, parameters=flow_run.parameters)
+        return {"ok": False, "summary": f"{type(error).__name__}: {' '.join(str(error).split())}"[:300]}
 
 
 def main(what: str) -> None:
@@ -102,8 +82,7 @@ def main(what: str) -> None:
         sys.stdout.write(json.dumps(check(Fleet.from_json(text))) + "\n")
         return
     job = json.loads(text)
-    machine = FleetMachine.from_plain(job["machine"])
-    outcome = run(machine, job["flow_run_id"])
+    outcome = run(job["parameters"], job["flow_run_id"])
     from pipelines.fleet import watching
 
     try:

@@ -130,7 +130,7 @@ class Deployments:
             if own:
                 waits = [r.next_scheduled_start_time or now for r in own]
                 waits += [before[machine.name].since] if machine.name in before else []  # for a run that is skipped now
-                self._due[machine.name] = Job(machine, min(waits), str(own[-1].id))
+                self._due[machine.name] = Job(machine, min(waits), str(own[-1].id), own[-1].parameters)
         if time.monotonic() >= self._upcoming_at_s:
             self._upcoming()
             self._upcoming_at_s = time.monotonic() + UPCOMING_S

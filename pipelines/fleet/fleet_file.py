@@ -170,18 +170,9 @@ class FleetMachine:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Those of the flow `pipelines.fleet.retraining.retrain`."""
+        """Those of `pipelines.fleet.retraining.retrain`."""
         lists = {k: list(getattr(self, k)) for k in ("recordings", "channels", "families", "selectors")}
         return {"machine_file": self.file, "effort": self.effort, **lists}
-
-    def as_plain(self) -> dict[str, Any]:
-        plain: dict[str, Any] = TypeAdapter(FleetMachine).dump_python(self, mode="json", exclude_unset=True)
-        return plain
-
-    @staticmethod
-    def from_plain(plain: dict[str, Any]) -> FleetMachine:
-        """The inverse of `as_plain`, also after JSON."""
-        return TypeAdapter(FleetMachine).validate_python(plain)
 
 
 @dataclass(frozen=True)

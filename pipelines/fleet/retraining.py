@@ -1,61 +1,60 @@
-"""One scheduled retraining as a Prefect flow: its name, its lines and its report are in Prefect's UI."""
+"""One scheduled retraining as a flow run of Prefect: its name, its lines and its report are in Prefect's UI."""
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
-from prefect import flow, get_run_logger, runtime
-from prefect.task_runners import ThreadPoolTaskRunner
-
 from data.errors import InputError, WorkError
 from data.machine import load_machine
-from pipelines.caller import LANES
-from pipelines.flows import PrefectCaller, link_report, log_to_server
+from pipelines.caller import DirectCaller
+from pipelines.flows import FlowRun
 from pipelines.jobs.request import request_for
 from pipelines.jobs.training import TrainOutcome, train
+from pipelines.prefect_reports import Reports
 from pipelines.settings import load
 
-finished: list[str] = []  # summaries of this process: known even where Prefect loses its server at the end of a run
 
-
-def _run_name() -> str:
-    """The run as the UI lists it: "retrain mill z x"."""
-    given = runtime.flow_run.parameters
-    return " ".join(("retrain", machine_name(given["machine_file"]), *given.get("channels", [])))
-
-
-@flow(name="thermodrift-retrain", flow_run_name=_run_name, task_runner=ThreadPoolTaskRunner(max_workers=LANES),
-      persist_result=False)  # fmt: skip
 def retrain(
     machine_file: str,
-    recordings: list[str],
+    recordings: Sequence[str],
     effort: str = "usual",
-    channels: list[str] | None = None,
-    families: list[str] | None = None,
-    selectors: list[str] | None = None,
+    channels: Sequence[str] | None = None,
+    families: Sequence[str] | None = None,
+    selectors: Sequence[str] | None = None,
+    reports: Reports | None = None,
+    scheduled: str | None = None,
 ) -> str:
     """Ingest what arrived since the last time and train if there is anything new; returns a summary.
 
-    Its lines are logged to the run, and the report is an artifact of it. An error is printed in one line, and the run
+    Its lines are those of the run, and the report is an artifact of it. An error is printed in one line, and the run
     counts as failed.
+
+    Args:
+        reports: the way to Prefect, which may have begun to come up; None opens one.
+        scheduled: the id of the run that a server has made for it.
     """
-    log_to_server()
-    log = get_run_logger()
-    request = request_for(machine_file, recordings, effort, channels or (), families or (), selectors or ())
-    try:
-        machine = load_machine(request.machine_file).machine
-        outcome = train(request, load(), PrefectCaller(machine=machine), say=log.info)
-    except (InputError, WorkError) as error:
-        log.error("not retrained: %s", error)
-        print(f"{datetime.now():%Y-%m-%d %H:%M} not retrained: {error}", flush=True)
-        raise
-    summary = summarized(outcome)
-    finished.append(summary)
-    log.info(summary)
-    print(f"{datetime.now():%Y-%m-%d %H:%M} {machine}: {summary}", flush=True)
-    if outcome.report is not None:
-        link_report(machine, outcome.report)
+    parameters = {
+        "machine_file": machine_file, "recordings": list(recordings), "effort": effort, "channels": channels,
+        "families": families, "selectors": selectors,
+    }  # fmt: skip
+    machine = machine_name(machine_file)
+    name = " ".join(("retrain", machine, *(channels or ())))
+    with FlowRun(reports or Reports(), "thermodrift-retrain", name, machine, parameters, scheduled) as run:
+        request = request_for(machine_file, recordings, effort, channels or (), families or (), selectors or ())
+        try:
+            outcome = train(request, load(), DirectCaller(working=run.working), say=run.line)
+        except (InputError, WorkError) as error:
+            run.line(f"not retrained: {error}", logging.ERROR)
+            print(f"{datetime.now():%Y-%m-%d %H:%M} not retrained: {error}", flush=True)
+            raise
+        summary = summarized(outcome)
+        run.line(summary)
+        print(f"{datetime.now():%Y-%m-%d %H:%M} {machine}: {summary}", flush=True)
+        if outcome.report is not None:
+            run.link(outcome.report)
     return summary
 
 

@@ -50,11 +50,12 @@ def started_apart(what: str, line: str, **streams: Any) -> subprocess.Popen[str]
 
 @dataclass(frozen=True)
 class Job:
-    """A machine whose turn has come, and since when it waits; `flow_run_id` where a server scheduled it."""
+    """A machine whose turn has come, and since when it waits; id and parameters of the run where a server made it."""
 
     machine: FleetMachine
     since: datetime
     flow_run_id: str | None = None
+    parameters: Mapping[str, Any] | None = None
 
 
 class Source(Protocol):
@@ -219,7 +220,8 @@ class Scheduler:
         result, log = (folder / f"{fleet_state.file_name(machine.name)}{suffix}" for suffix in (".result", ".log"))
         result.unlink(missing_ok=True)
         with log.open("w", encoding="utf-8") as out:
-            line = {"machine": machine.as_plain(), "flow_run_id": job.flow_run_id, "result": str(result)}
+            parameters = machine.parameters if job.parameters is None else dict(job.parameters)
+            line = {"parameters": parameters, "flow_run_id": job.flow_run_id, "result": str(result)}
             process = started_apart("run", json.dumps(line), stdout=out, stderr=subprocess.STDOUT)
         return Run(job, process, result, log, now)
 

@@ -76,7 +76,7 @@ def serve_fleet(fleet: Fleet, home: Path, say: Say, rounds: int | None = None) -
     """Retrain the machines of a checked fleet when they are due, until interrupted (or for `rounds` runs).
 
     Where PREFECT_API_URL names a server, each machine is a deployment there. Without one this process waits by itself,
-    and each run starts Prefect's temporary server.
+    and each run is reported to Prefect's temporary server.
 
     Raises:
         InputError: another process serves the fleet, or the machine files cannot be used.

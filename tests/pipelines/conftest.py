@@ -10,9 +10,11 @@ from typing import Any
 
 import pytest
 
+from pipelines import caller
 from pipelines import settings as settings_module
 from tests.toys.command import Call, in_process
 
+SLOW_COMPUTER_S = 300  # for imports
 PNG = bytes.fromhex(  # one grey pixel
     "89504e470d0a1a0a0000000d49484452000000010000000108000000003a7e9b55"
     "0000000a49444154789c636800000082008177cd72b60000000049454e44ae426082"
@@ -22,6 +24,13 @@ PNG = bytes.fromhex(  # one grey pixel
 @pytest.fixture(scope="session", autouse=True)
 def no_migrations(copied_stores: None) -> None:
     """Homes get a copy of one empty store."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_retries() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(caller, "RETRY_DELAY_S", 0.01)
+        yield
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -77,19 +86,20 @@ def store(store_home: Path) -> Iterator[object]:
 
 @pytest.fixture(scope="session")
 def flows(store: object, store_home: Path) -> Iterator[ModuleType]:
-    """The flows on one temporary server for all tests."""
+    """The flows, and one server for the reports of all tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("THERMODRIFT_HOME", str(store_home))
-        patch.delenv("PREFECT_API_URL", raising=False)
         settings_module.configure_environment()
         from prefect.server.api.server import SubprocessASGIServer
+        from prefect.settings import PREFECT_API_URL, temporary_settings
 
         from pipelines import flows as module
-        from pipelines.prefect_server import start_server
+        from pipelines import prefect_reports
 
-        patch.setattr(module, "RETRY_DELAY_S", 0.01)
-        server = start_server()
-        assert server is not None
-        server.join()
-        yield module
-        SubprocessASGIServer().stop()
+        patch.setattr(prefect_reports, "END_S", SLOW_COMPUTER_S)
+        server = SubprocessASGIServer()
+        server.start(timeout=SLOW_COMPUTER_S)
+        patch.setenv("PREFECT_API_URL", server.api_url)
+        with temporary_settings({PREFECT_API_URL: server.api_url}):
+            yield module
+        server.stop()

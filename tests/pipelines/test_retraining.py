@@ -1,4 +1,4 @@
-"""One scheduled retraining as a flow: it learns once, and says so in Prefect."""
+"""One scheduled retraining as a flow run: it learns once, and says so in Prefect."""
 
 from __future__ import annotations
 
@@ -84,6 +84,6 @@ def test_a_failure_is_one_line_and_a_failed_run(
     shown = capfd.readouterr()
     assert shown.out.count("not retrained: the share does not answer") == 1
     assert "Traceback" not in shown.out + shown.err
-    runs, _, lines, _ = _in_prefect("retrain flow-share z", 2)
+    runs, _, lines, _ = _in_prefect("retrain flow-share z")
     assert [r.state.name for r in runs] == ["Failed"]
     assert "not retrained: the share does not answer" in lines and not any("Traceback" in text for text in lines)

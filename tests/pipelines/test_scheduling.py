@@ -29,9 +29,9 @@ WEEK = timedelta(days=7)
 APART = scheduling.APART  # of the program
 # A run that does what its machine's name says.
 TOY = """
-import json, os, signal, subprocess, sys, time
+import json, os, pathlib, signal, subprocess, sys, time
 job = json.loads(sys.stdin.readline())
-name = job["machine"]["name"]
+name = pathlib.Path(job["parameters"]["machine_file"]).stem
 if name.startswith("killed"): os.kill(os.getpid(), signal.SIGKILL)
 if name.startswith("slow"):
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -249,7 +249,7 @@ def _lives(pid: int) -> bool:
 def test_a_process_of_a_fleet_ends_with_the_one_that_started_it(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
     monkeypatch.setattr(scheduling, "APART", APART)
     fleet = fleet_of("lathe")
-    job = {"machine": fleet.machines[0].as_plain(), "flow_run_id": None, "result": "/m/result"}
+    job = {"parameters": fleet.machines[0].parameters, "flow_run_id": None, "result": "/m/result"}
     line = fleet.as_json() if what == "check" else json.dumps(job)
     process = scheduling.started_apart(what, line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:

@@ -36,7 +36,7 @@ def unfinished(c: Command) -> object:
 
 
 def server(c: Command) -> object:
-    return [line for line in c.processes().values() if "prefect.server" in line or "uvicorn" in line]
+    return [line for line in c.processes().values() if "prefect_process" in line]
 
 
 def workers(c: Command) -> object:
