@@ -29,7 +29,8 @@ def test_retraining_learns_once(
     machine = write_machine(tmp_path / "m.yml", "flow-again")
     write_year(tmp_path / "in", 5)
     first = retraining.retrain(str(machine), [str(tmp_path / "in")], **SMALL)
-    again = retraining.retrain(str(machine), [str(tmp_path / "in")], **SMALL)
+    scheduled = _scheduled("retrain flow-again z")
+    again = retraining.retrain(str(machine), [str(tmp_path / "in")], **SMALL, scheduled=scheduled)
     assert "flow-again-z version 1 is champion" in first
     assert again == "the last training saw the same batches; nothing new to learn"
     (tmp_path / "in" / "20251015.csv").write_text("nothing")
@@ -38,10 +39,20 @@ def test_retraining_learns_once(
     assert f"flow-again: {again}" in shown.out
     assert "Traceback" not in shown.out + shown.err
     runs, tasks, lines, links = _in_prefect("retrain flow-again z", 12)
-    assert len(runs) == 3
+    assert [r.state.name for r in runs] == 3 * ["Completed"] and scheduled in {str(r.id) for r in runs}
     assert {"grid flow-again z ridge", "grid flow-again z zero", "ingest flow-again", "track flow-again z"} <= tasks
     assert "grid" in lines and first in lines
     assert any(f"{store.home}/reports/flow-again-" in link for link in links)
+
+
+def _scheduled(name: str) -> str:
+    """The id of a run that the server has made and handed out."""
+    from prefect.client.orchestration import get_client
+
+    with get_client(sync_client=True) as client:
+        flow = client.create_flow_from_name("thermodrift-retrain")
+        run = {"flow_id": str(flow), "name": name, "state": {"type": "PENDING"}}
+        return str(client.request("POST", "/flow_runs/", json=run).json()["id"])
 
 
 def _in_prefect(run_name: str, at_least: int = 1) -> tuple[list[Any], set[str], list[str], list[str]]:
