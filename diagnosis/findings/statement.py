@@ -231,9 +231,7 @@ def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Se
     seen = list(least.values())[:_MAX_NAMED]
     rest = len(limits) - len(seen)
     more = f" and {rest} more in the table of limits" if rest else ""
-    return (
-        f"{text}. An effect above these limits would have been claimed: {', '.join(seen)}{more}." if seen else f"{text}."
-    )
+    return f"{text}. An effect above these limits would be claimed: {', '.join(seen)}{more}." if seen else f"{text}."
 
 
 def _sentence(found: Found) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -101,23 +101,41 @@ def one_round(
     seen = screen(now, [*(s.candidate for s in seen.scored), *more], seen)
     odds = odds_of(now, seen)
     tried = refits(now, seen, shortlist(now, seen, odds), odds, workers, tell)
-    now, tried = _fair(now, tried)
     known = {n: f for n, (_, f) in forms.items()}
     return decided(Round(now, seen, tuple(tried), forms=known))
 
 
 def decided(done: Round) -> Round:
-    """A round with its likeliest explanations under the covariance that is likeliest for each, and their figures; what
-    alone makes possible what the recordings show comes first."""
+    """A round with its likeliest explanations, and the fit before, each at its own optimum under the covariance that is
+    likeliest for it, and their figures; what alone makes possible what the recordings show comes first."""
     strange = frozenset(i.channel for i in impossible(done.before))
     able = [t for t in done.tried if _resolves(t, strange)]
     likely = [*able, *(t for t in done.tried if t not in able)][: max(POLICY.settled, len(able))]
-    settled = [_settled(done.before, t) for t in likely]
-    first = sorted(settled, key=lambda t: (not _resolves(t, strange), -t.standing))
-    tried = (*first, *(t for t in done.tried if t not in likely))
+    settled = [replace(t, fitted=relearned(t.fitted)) for t in likely]
+    before = _fair(done.before, settled)
+    tried = [_against(before, t) for t in (*settled, *(t for t in done.tried if t not in likely))]
     if not tried:
         return done
-    return replace(done, tried=tried, figures=figures(done.before, tried), resolved=_resolves(tried[0], strange))
+    first = sorted(tried[: len(settled)], key=lambda t: (not _resolves(t, strange), -t.standing))
+    tried = [*first, *sorted(tried[len(settled) :], key=lambda t: -t.standing)]
+    return replace(
+        done, before=before, tried=tuple(tried), figures=figures(before, tried), resolved=_resolves(tried[0], strange)
+    )
+
+
+def _fair(now: Fitted, settled: Sequence[Tried]) -> Fitted:
+    """The fit before at the best optimum that is known without any effect: what a refit has found on its way, and would
+    keep without its effect, is no gain of that effect."""
+    best = relearned(now) if settled else now
+    for t in settled:
+        with suppress(InputError, WorkError):  # where it has gone with the effect, no machine without it is
+            back = relearned(refitted(t.fitted, now.part))
+            best = back if back.log_evidence > best.log_evidence else best
+    return best
+
+
+def _against(before: Fitted, t: Tried) -> Tried:
+    return replace(t, gain=t.fitted.log_evidence - before.log_evidence, by_run=t.fitted.foretold - before.foretold)
 
 
 def _forms(now: Fitted) -> dict[str, tuple[Candidate, Form]]:
@@ -126,31 +144,9 @@ def _forms(now: Fitted) -> dict[str, tuple[Candidate, Form]]:
     return {c.name: (c, f) for c, f in every if c.name not in now.part.mechanisms}
 
 
-def _settled(now: Fitted, t: Tried) -> Tried:
-    """A refit under the covariance that is likeliest for it, as the fit before is under its own: structure may have
-    stood in for an effect."""
-    fitted = relearned(t.fitted)
-    return replace(t, fitted=fitted, gain=fitted.log_evidence - now.log_evidence, by_run=fitted.foretold - now.foretold)
-
-
 def _resolves(t: Tried, before: frozenset[str]) -> frozenset[str]:
     """Channels that show what the fit before cannot do whatever its values, and that this one can and so gains."""
     return before - {i.channel for i in impossible(t.fitted)} if before and t.gain > 0 else frozenset()
-
-
-def _fair(now: Fitted, tried: list[Tried]) -> tuple[Fitted, list[Tried]]:
-    """The fit before as good as the best refit is without its candidate, so that no gain is due to a better start."""
-    for t in tried[: POLICY.settled]:
-        try:
-            back = refitted(t.fitted, now.part)
-        except (InputError, WorkError):
-            continue  # where it has gone with the effect, no machine without it is
-        more = back.log_evidence - now.log_evidence
-        if more > POLICY.telling_nats:
-            lost = back.foretold - now.foretold
-            tried = [replace(o, gain=o.gain - more, by_run=o.by_run - lost) for o in tried]
-            now = back
-    return now, sorted(tried, key=lambda t: -t.standing)
 
 
 def without(part: TwinPart, c: Candidate, original: TwinPart) -> TwinPart:

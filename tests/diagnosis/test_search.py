@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -16,7 +17,7 @@ from diagnosis.policy import POLICY
 from diagnosis.screening.screen import proposed
 from diagnosis.search import search as search_module
 from diagnosis.search.claims import Round
-from diagnosis.search.search import Search, one_round, search, without
+from diagnosis.search.search import Search, decided, one_round, search, without
 from tests.diagnosis.small_cases import DRIFT, FLOOR, SHIFT, fitted, runs, two_bodies
 from twin.calibration.identifiability import Interval, intervals90
 from twin.calibration.least_squares import result
@@ -114,8 +115,17 @@ def test_a_baseline_stays_where_without_the_effect_no_machine_is(monkeypatch: py
 
     r = found("drift").rounds[0]
     monkeypatch.setattr(search_module, "refitted", stiff)
-    now, tried = search_module._fair(r.before, list(r.tried))
-    assert now is r.before and tried[0].gain == max(t.gain for t in tried if t.cluster == tried[0].cluster)
+    assert search_module._fair(r.before, r.tried).log_evidence >= r.before.log_evidence
+
+
+def test_what_a_refit_would_keep_without_its_effect_is_no_gain() -> None:
+    """A fit before that has stopped short of its likeliest sizes and noise."""
+    r = found("drift").rounds[0]
+    short = replace(r.before, hyper=replace(r.before.hyper, structure=8.0, starts=1.0))
+    assert short.log_evidence < r.before.log_evidence - 10
+    again = decided(replace(r, before=short))
+    assert again.before.log_evidence > r.before.log_evidence - 1 and again.best is not None and r.best is not None
+    assert again.best.gain == pytest.approx(r.best.gain, abs=2.0)
 
 
 def test_what_was_accepted_can_be_taken_out_again() -> None:

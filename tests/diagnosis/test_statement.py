@@ -202,11 +202,11 @@ def test_verdicts() -> None:
     after = (Rms("z", "um", 1.3, 1.3, 1.2),)
     assert verdict_statement("consistent", rms=after, limits=limits, places=["the bed"] * 6) == (
         "Nothing is missing: the remaining error is the noise (z 1.3 µm (noise 1.2)). An effect above these limits "
-        "would have been claimed: heat to the floor at the bed 1.8 W/K, waste heat of a control cabinet or of auxiliaries "
+        "would be claimed: heat to the floor at the bed 1.8 W/K, waste heat of a control cabinet or of auxiliaries "
         "at the bed 12 W, sunlight on one face at the bed 20 W/m² and 3 more in the table of limits."
     )
     assert verdict_statement("consistent", rms=after, limits=limits[:2], places=["the bed"] * 2).endswith(
-        "would have been claimed: heat to the floor at the bed 1.8 W/K and 1 more in the table of limits."
+        "would be claimed: heat to the floor at the bed 1.8 W/K and 1 more in the table of limits."
     )
     assert verdict_statement("consistent") == "Nothing is missing: the remaining error is the noise."
     more = "Too weak for a claim: heat to the floor: bed. A night switched off would show more."
