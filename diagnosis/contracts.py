@@ -251,8 +251,8 @@ class Fitted(Point):
 
     @cached_property
     def log_evidence(self) -> float:
-        """Nats, up to a constant of the recordings (Laplace approximation)."""
-        return self.level.log_evidence(self.grams)
+        """Nats, up to a constant of the recordings (Laplace approximation), of what z shows."""
+        return self.level.log_evidence(self.grams, self.z)
 
     @cached_property
     def foretold(self) -> Array:

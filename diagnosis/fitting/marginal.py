@@ -203,12 +203,13 @@ class Level:
             inner, cross, factor = inner - each_inner[without], cross - each_cross[without], self.folds[without]
         return np.asarray(inner - cross.T @ cho_solve(factor, cross))
 
-    def log_evidence(self, grams: Grams) -> float:
+    def log_evidence(self, grams: Grams, z: Array | None = None) -> float:
         """Log marginal likelihood, up to a constant, of columns [model (p), target]: parameters of prior
-        N(0, `values`²) integrated out."""
-        return self._log_evidence(self.products(grams))
+        N(0, `values`²) integrated out. The peak is taken where the columns promise it, or at z (p,), where it was
+        simulated: derivatives of another point promise too much."""
+        return self._log_evidence(self.products(grams), z=z)
 
-    def _log_evidence(self, products: tuple[Array, Array], without: int | None = None) -> float:
+    def _log_evidence(self, products: tuple[Array, Array], without: int | None = None, z: Array | None = None) -> float:
         try:
             c = self._reduced(*products, without)
             root = np.linalg.cholesky(c[:-1, :-1] + self.prior * np.eye(len(c) - 1))
@@ -220,7 +221,10 @@ class Level:
         logs += float(self._volume.sum()) - (len(c) - 1) * np.log(self.prior)
         if without is not None:
             logs -= float(self._volume[without])
-        return -0.5 * (float(c[-1, -1] - fitted @ fitted) + logs)
+        if z is None:
+            return -0.5 * (float(c[-1, -1] - fitted @ fitted) + logs)
+        aim = np.append(-z, 1.0)
+        return -0.5 * (float(aim @ c @ aim + self.prior * (z @ z)) + logs)
 
     def foretold(self, grams: Grams) -> Array:
         """Log density (B,) of every batch, predicted from all others."""
