@@ -10,14 +10,13 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from itertools import pairwise
-from typing import Any, Literal
-
-from matplotlib.figure import Figure
-from matplotlib.text import Text as FigureText
+from typing import TYPE_CHECKING, Any, Literal
 
 from data.units import in_error_unit
-from reports.drawing import inline_svg
 from reports.viewer import Viewer
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _MANTISSAS = ((1, 1.5, 2, 3, 4, 5, 6, 8), (1, 2, 3, 5), (1, 2, 5), (1, 3), (1,))  # densest first
 _CLOSEST, _MOST_TICKS = 7.0, 7  # least distance of two ticks, in 0..100
@@ -180,6 +179,9 @@ def with_unit(block: Any, unit: str) -> Any:
     """A part of a page on errors in µm as one on errors in `unit`: its texts, also those of figures."""
     if unit == "um":
         return block
+    from matplotlib.figure import Figure  # takes long to load
+    from matplotlib.text import Text as FigureText
+
     if isinstance(block, str):
         return in_error_unit(block, unit)
     if isinstance(block, Figure):
@@ -211,6 +213,8 @@ class Plot:
 
     def svg(self, anchor: str) -> str:
         """The figure as an svg element with ids that begin with `anchor`."""
+        from reports.drawing import inline_svg
+
         return inline_svg(self.figure, anchor)
 
 

@@ -14,7 +14,6 @@ from typing import Any
 from xml.etree.ElementTree import ParseError
 
 import numpy as np
-import openpyxl
 import pyarrow as pa
 
 from data.errors import InputError
@@ -86,10 +85,12 @@ class XlsxReader(Reader):
 
     @contextmanager
     def open(self, path: Path, hints: Sequence[str]) -> Iterator[list[Sheet]]:
+        from openpyxl import load_workbook  # takes long to load
+
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # openpyxl warns of styles and extensions, which do not matter here
             try:
-                book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+                book = load_workbook(path, read_only=True, data_only=True)
             except _DAMAGE as error:
                 raise _damaged(path, error) from None
             try:

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, fields
+from statistics import NormalDist
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pandas as pd
-from scipy.special import ndtri
 
 from data.arrays import Array
 
@@ -25,7 +25,7 @@ _WEIGHTS = {"forward": 1.0, "leave-season-out": 0.5, "leave-speed-out": 0.5, "le
 # Few runs have no 90 % quantile. A log-normal distribution counts as so many runs; its sd is that of ln S over the runs
 # of one model (lathe 0.5, spindle 0.7, sample year 0.6).
 _PRIOR_RUNS, _PRIOR_SD = 4.0, 0.6
-_PRIOR_Z = ndtri((np.arange(20) + 0.5) / 20)
+_PRIOR_Z = np.array([NormalDist().inv_cdf((k + 0.5) / 20) for k in range(20)])
 # Slopes of ln S with ln disagreement and ln(1 + distance) before any run is known, and the sd of what is believed.
 _SLOPES, _SLOPE_SD = np.array([0.25, 0.25]), 0.15
 _FLOOR = 0.05  # of the median S: a smaller disagreement of models carries no information

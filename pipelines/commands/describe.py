@@ -46,12 +46,13 @@ def describe_twin(machine_file: Path, out: Path | None = None, at: Sequence[str]
         InputError: no twin part or an invalid one, an unknown driver, a file that exists or cannot be written.
     """
     from data.machine import load_machine
-    from reports.twin.page import PICTURES, TwinData, write_picture, write_twin_report
     from twin.compile import compile_network, expanded
     from twin.schema import twin_part
     from twin.views.overview import machine_modes, mode_views, overview
 
     if out is not None:
+        from reports.twin.page import PICTURES  # takes long to load
+
         check_suffix("--out", out, PICTURES)
         if out.exists():
             raise InputError(f"{out} exists; give another --out or remove it first")
@@ -70,20 +71,26 @@ def describe_twin(machine_file: Path, out: Path | None = None, at: Sequence[str]
     if known is not None:
         origin = f"calibrated on {len(known.batches)} {'simulated ' if known.simulated else ''}batches, {known.when}"
     shown = Described(network, view, modes, origin)
-    if out is not None and out.suffix == ".html":
-        write_twin_report(out, TwinData(view, network.parameters, origin, modes=modes))
-    elif out is not None:
-        write_picture(out, view)
+    if out is not None:
+        _draw(out, shown)
     return shown
+
+
+def _draw(out: Path, shown: Described) -> None:
+    from reports.twin.page import TwinData, write_picture, write_twin_report
+
+    if out.suffix == ".html":
+        write_twin_report(out, TwinData(shown.view, shown.network.parameters, shown.origin, modes=shown.modes))
+    else:
+        write_picture(out, shown.view)
 
 
 def print_twin(shown: Described) -> None:
     """Bodies and time constants."""
     from reports.twin import tables
-    from reports.twin.network_picture import counted
 
     view = shown.view
-    console.line(f"{view.machine}{' (SIMULATED)' if view.simulated else ''}: {counted(view)}")
+    console.line(f"{view.machine}{' (SIMULATED)' if view.simulated else ''}: {tables.counted(view)}")
     console.line(f"values {shown.origin}")
     for s in view.surroundings:
         console.line(f"surrounding {s.name}: {s.label}")

@@ -46,26 +46,35 @@ def model_folder(model_uri: str, settings: Settings) -> Path:
                 "runs:/RUN/model or the folder of a stored model"
             )
         return Path(model_uri)
-    from mlflow.exceptions import MlflowException
-
-    from pipelines.store.model_store import registered
-    from pipelines.store.registry import find_version, local_folder, version_folder
-    from pipelines.store.tracking import open_store, store_errors
+    from pipelines.store import lookups
+    from pipelines.store.model_store import registered, verified
 
     if model_uri.startswith("runs:/"):
-        run_id = model_uri.removeprefix("runs:/").split("/")[0]
-        try:
-            open_store(settings).get_run(run_id)
-        except MlflowException:
-            raise InputError(f"model {model_uri!r}: no run {run_id!r} in {settings.store_name}") from None
-        return Path(local_folder(model_uri, settings))
+        return _run_folder(model_uri, settings)
     named = registered(model_uri)
     if named is None:
         raise InputError(f"model {model_uri!r}: expected models:/NAME@alias or models:/NAME/VERSION")
-    with store_errors(settings):
-        client = open_store(settings)
-        version = find_version(client, *named)
-    return version_folder(version, settings)
+    known = lookups.kept(settings)
+    place = known.place(*named)
+    if place is None:
+        from pipelines.store.registry import look_up
+
+        place = look_up(*named, known, settings)
+    return verified(Path(place.folder), place.sha256)
+
+
+def _run_folder(model_uri: str, settings: Settings) -> Path:
+    from mlflow.exceptions import MlflowException
+
+    from pipelines.store.registry import local_folder
+    from pipelines.store.tracking import open_store
+
+    run_id = model_uri.removeprefix("runs:/").split("/")[0]
+    try:
+        open_store(settings).get_run(run_id)
+    except MlflowException:
+        raise InputError(f"model {model_uri!r}: no run {run_id!r} in {settings.store_name}") from None
+    return Path(local_folder(model_uri, settings))
 
 
 def predict_file(model_uri: str, file: Path, settings: Settings) -> pd.DataFrame:

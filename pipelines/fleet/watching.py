@@ -24,6 +24,7 @@ from data.files import write_atomic
 from pipelines.caller import Say
 from pipelines.fleet import fleet_state
 from pipelines.home import home
+from pipelines.store import lookups
 
 if TYPE_CHECKING:
     from data.batch import Batch
@@ -289,21 +290,14 @@ def _made_from(settings: Settings, lake: Lake) -> dict[str, Any] | None:
     if store is None or not isinstance(root, Path):
         return None
     logs = [root / "_quarantine", *sorted(root.glob("_quarantine/*/reasons.jsonl"))]
-    return _stats([store, Path(f"{store}-wal"), root / "_manifest.json", *logs])
+    return _stats([*lookups.store_files(store), root / "_manifest.json", *logs])
 
 
 def _stats(files: Iterable[Path]) -> dict[str, Any]:
     """Size and time of change of files, None where one is not there; the settings file of the working directory, and
     the variables that decide where store and lake are. MLFLOW_TRACKING_URI is none of them: MLflow itself sets it."""
-    found: dict[str, list[int] | None] = {}
-    for file in files:
-        try:
-            seen = file.stat()
-            found[str(file)] = [seen.st_size, seen.st_mtime_ns]
-        except OSError:
-            found[str(file)] = None
     settings = Path("mlflow.yml").resolve()
     own = settings.read_text(encoding="utf-8", errors="replace") if settings.exists() else ""
     named = dict.fromkeys((*_VARIABLES, *_NAMED.findall(own)))
     variables = {v: hashlib.sha256(os.environ.get(v, "").encode()).hexdigest() for v in named}  # some are secrets
-    return {"files": found, "variables": variables, "settings": own}
+    return {"files": lookups.stats(files), "variables": variables, "settings": own}

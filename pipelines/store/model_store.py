@@ -213,6 +213,24 @@ def digest(folder: Path) -> str:
     return hashlib.sha256((inner_folder(folder) / "model.json").read_bytes()).hexdigest()
 
 
+def verified(folder: Path, sha256: str) -> Path:
+    """The folder of a registered model, whose `digest` the registry has as `sha256` (empty: an earlier program's).
+
+    Raises:
+        InputError: `model.json` is another one.
+    """
+    try:
+        got = digest(folder) if sha256 else ""
+    except OSError:
+        return folder  # `load` says what is missing
+    if got != sha256:
+        raise InputError(
+            f"model folder {folder}: model.json is not the one that was registered (sha256 {got[:12]}…, the registry "
+            f"has {sha256[:12]}…); restore it from a backup, or promote the model again"
+        )
+    return folder
+
+
 def load(folder: Path) -> StoredModel:
     """Read a stored model from its folder, or from the folder of the MLflow model around it.
 

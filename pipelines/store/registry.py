@@ -38,7 +38,7 @@ from models.selection.promotion import Choice, Comparison, compare_paired, left_
 from models.selection.result import GridResult
 from models.selection.trust import Region
 from pipelines.settings import Settings
-from pipelines.store import audit, database, fitted_model, model_store, pyfunc_model
+from pipelines.store import audit, database, fitted_model, lookups, model_store
 from pipelines.store.audit import CHAMPION, PROVISIONAL
 from pipelines.store.runs import (
     close_interrupted,
@@ -405,9 +405,7 @@ def find_model(client: MlflowClient, name: str) -> RegisteredModel:
     except MlflowException as error:
         if error.error_code != ErrorCode.Name(RESOURCE_DOES_NOT_EXIST):
             raise
-        names = [m.name for m in registered_models(client)]
-        hint = closest(name, names) if names else "the registry is empty; train first"
-        raise InputError(f"unknown model {name!r}; {hint}") from None
+        raise lookups.unknown_model(name, (m.name for m in registered_models(client))) from None
 
 
 def find_version(client: MlflowClient, name: str, which: str) -> ModelVersion:
@@ -448,17 +446,23 @@ def version_folder(version: Registered, settings: Settings) -> Path:
     Raises:
         InputError: `model.json` is another one.
     """
-    folder, sha256 = Path(local_folder(version.source, settings)), version.tags.get("sha256", "")
-    try:
-        got = model_store.digest(folder) if sha256 else ""
-    except OSError:
-        return folder  # `model_store.load` says what is missing
-    if got != sha256:
-        raise InputError(
-            f"model folder {folder}: model.json is not the one that was registered (sha256 {got[:12]}…, the registry "
-            f"has {sha256[:12]}…); restore it from a backup, or promote the model again"
-        )
-    return folder
+    place = _place(version, settings)
+    return model_store.verified(Path(place.folder), place.sha256)
+
+
+def _place(version: Registered, settings: Settings) -> lookups.Place:
+    return lookups.Place(local_folder(version.source, settings), version.tags.get("sha256", ""))
+
+
+def look_up(name: str, which: str, known: lookups.Registry, settings: Settings) -> lookups.Place:
+    """Where the files of a version are; kept together with what is `known`. Raises as `find_version`."""
+    client = open_store(settings)
+    with store_errors(settings):
+        version = find_version(client, name, which)
+        aliases = {m.name: {a: str(n) for a, n in m.aliases.items()} for m in registered_models(client)}
+    place = _place(version, settings)
+    lookups.keep(known, aliases, f"{name}/{version.version}", place, settings.home)
+    return place
 
 
 def local_folder(uri: str, settings: Settings) -> str:
@@ -550,6 +554,7 @@ def _log_version(client: MlflowClient, name: str, new: Newcomer, tags: dict[str,
 
     Models from code: MLflow keeps `pyfunc_model.py` and the plain files of `model_store`; nothing is pickled.
     """
+    from pipelines.store import pyfunc_model
     from pipelines.store.serving import write_served  # loads onnx
 
     choice, result, info = new.choice, new.result, _info(new)

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from data.units import unit_label
-from reports.labels import INK, ORANGE, count, number
+from reports.labels import INK, ORANGE, number
 from reports.twin.glyphs import (
     CHAINS,
     EDGE,
@@ -33,6 +33,7 @@ from reports.twin.glyphs import (
     say,
     width_in,
 )
+from reports.twin.tables import capacity_label, counted
 from twin.views.layout import places
 from twin.views.overview import BodyView, ChainView, HeatView, Overview, Tie
 
@@ -353,21 +354,6 @@ def network_picture(view: Overview) -> Figure:
     if view.chains:
         chain_strip(fig, view.chains, strip)
     return fig
-
-
-def counted(view: Overview) -> str:
-    """What the network consists of, in a line."""
-    n, links = len(view.bodies), sum(not t.ground for t in view.ties)
-    parts = [f"{n} {'body' if n == 1 else 'bodies'}", count(links, "link"), count(len(view.ties) - links, "exposure")]
-    parts.append(count(len(view.sensors), "sensor"))
-    return f"{', '.join(parts)}; {view.free} free and {view.fixed} fixed parameters"
-
-
-def capacity_label(b: BodyView) -> str:
-    """``6.6 kJ/K``, with the number of cells where a body has several."""
-    joules = b.capacity_J_per_K
-    label = f"{number(joules / 1e3, 1 if joules < 1e5 else 0)} kJ/K" if joules >= 1e3 else f"{joules:.3g} J/K"
-    return label + (f", {b.n_cells} cells" if b.n_cells > 1 else "")
 
 
 def heat_label(h: HeatView) -> str:

@@ -19,7 +19,7 @@ from reports.rendering import write_page
 from reports.twin import tables
 from reports.twin.figures import fit_figure, mode_shapes, residual_map, rms_map
 from reports.twin.flows import flow_picture, heat_stack
-from reports.twin.network_picture import counted, network_picture
+from reports.twin.network_picture import network_picture
 from reports.viewer import Pane, Trace, viewer
 from twin.calibration import Calibration
 from twin.calibration.identifiability import Interval
@@ -98,7 +98,7 @@ def twin_page(data: TwinData, most_batches: int = MOST_BATCHES, pictures: bool =
     sections += [_fit(data, most_batches, pictures)] if data.compared or data.left_out is not None else []
     sections += [_heat(data, most_batches, pictures)] if data.flows else []
     sections += [_modes(data, pictures)] if data.modes else []
-    facts = [("Machine", view.machine), ("Network", counted(view)), ("Values", data.origin)]
+    facts = [("Machine", view.machine), ("Network", tables.counted(view)), ("Values", data.origin)]
     batches = list(dict.fromkeys([c.batch_id for c in data.compared] + [f.batch_id for f in data.flows]))
     if batches:
         named = ", ".join(batches[:3]) + (f" and {len(batches) - 3} more" if len(batches) > 3 else "")

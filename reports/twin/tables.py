@@ -4,20 +4,37 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
 from data.units import unit_label
-from reports.labels import NOTHING, number, percent, three_digits
+from reports.labels import NOTHING, count, number, percent, three_digits
 from reports.layout import Column, Row, Table
-from reports.twin.network_picture import capacity_label
-from twin.calibration.identifiability import Interval
 from twin.quantity import Parameter
 from twin.views.heat_flows import HeatFlows
-from twin.views.overview import ModeView, Overview, time_words
+from twin.views.overview import BodyView, ModeView, Overview, time_words
+
+if TYPE_CHECKING:
+    from twin.calibration.identifiability import Interval
 
 _KINDS = {"heat": "put in", "storage": "stored in", "loss": "taken by", "link": "through"}
 _KNOWN = 0.5  # posterior sd by prior sd, below which the recordings say more than the prior
+
+
+def counted(view: Overview) -> str:
+    """What the network consists of, in a line."""
+    n, links = len(view.bodies), sum(not t.ground for t in view.ties)
+    parts = [f"{n} {'body' if n == 1 else 'bodies'}", count(links, "link"), count(len(view.ties) - links, "exposure")]
+    parts.append(count(len(view.sensors), "sensor"))
+    return f"{', '.join(parts)}; {view.free} free and {view.fixed} fixed parameters"
+
+
+def capacity_label(b: BodyView) -> str:
+    """``6.6 kJ/K``, with the number of cells where a body has several."""
+    joules = b.capacity_J_per_K
+    label = f"{number(joules / 1e3, 1 if joules < 1e5 else 0)} kJ/K" if joules >= 1e3 else f"{joules:.3g} J/K"
+    return label + (f", {b.n_cells} cells" if b.n_cells > 1 else "")
 
 
 def bodies(view: Overview) -> Table:

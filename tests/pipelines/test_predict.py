@@ -26,7 +26,7 @@ from models.selection.promotion import choose
 from models.selection.trust import Region
 from pipelines.cli import app
 from pipelines.commands.predict import as_cell, load_model, predict_batches, predict_file, summary
-from pipelines.store import model_store, registry
+from pipelines.store import lookups, model_store, registry
 from tests.models.twin_year import recording, two_errors
 from tests.toys.tracked import log_training
 from tests.toys.training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
@@ -347,6 +347,36 @@ def test_unknown_models_are_told_with_the_closest(promoted, store, uri, words):
         load_model(uri, store)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_name_is_looked_up_once_until_the_store_changes(promoted, store, monkeypatch):
+    name = promoted[0].name
+    look_up, asked = registry.look_up, []
+    monkeypatch.setattr(registry, "look_up", lambda *given: (asked.append(given[:2]), look_up(*given))[1])
+    client = registry.open_store(store)
+    client.set_registered_model_alias(name, "tried", "1")
+    for uri in (f"models:/{name}@tried", f"models:/{name}/1", f"models:/{name}"):
+        load_model(uri, store)
+    with pytest.raises(InputError, match="unknown model 'toy-predcit-z'; did you mean 'toy-predict-z'"):
+        load_model("models:/toy-predcit-z", store)
+    assert asked == [(name, "tried")]
+    client.delete_registered_model_alias(name, "tried")
+    with pytest.raises(InputError, match="has no alias 'tried'"):
+        load_model(f"models:/{name}@tried", store)
+    assert asked == [(name, "tried")] * 2
+
+
+def test_nothing_is_kept_of_a_server_or_of_files_elsewhere(store, tmp_path):
+    own, place = replace(store, home=tmp_path), lookups.Place(str(tmp_path / "download"), "")
+    for changed in ({"store_uri": "http://127.0.0.1:1"}, {"artifacts_uri": "s3://bucket"}, {}):
+        settings = replace(own, **changed)
+        lookups.keep(lookups.kept(settings), {"m": {}}, "m/1", place, settings.home)
+        assert not lookups.kept(settings).aliases
+    inside = replace(own, artifacts_uri=tmp_path.as_uri())
+    lookups.keep(lookups.kept(inside), {"m": {"champion": "1"}}, "m/1", place, tmp_path)
+    assert lookups.kept(inside).place("m", "champion") == place
+    (tmp_path / "registry.json").write_text("[]")
+    assert lookups.kept(inside).place("m", "champion") is None
 
 
 def test_a_table_of_several_batches_starts_each_at_zero(stored):

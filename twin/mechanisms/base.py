@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from data.arrays import Numeric
 from data.errors import closest
@@ -237,4 +236,6 @@ def course(share: Numeric, *values: Numeric) -> Numeric:
 @cache
 def _pieces(n: int) -> NDArray[np.float64]:
     """Coefficients (n, 4, n - 1): what each value adds, by power from the third down and by piece."""
+    from scipy.interpolate import CubicSpline  # takes long to load
+
     return np.moveaxis(CubicSpline(np.arange(n), np.eye(n), bc_type="natural").c, -1, 0)

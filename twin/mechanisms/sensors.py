@@ -7,7 +7,6 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from data.arrays import Numeric
 from data.errors import closest
@@ -159,6 +158,8 @@ def _filtered(seen: Numeric, kept: Numeric, before: Numeric, now: Numeric) -> Nu
 
 
 def _of_one_lag(seen: Numeric, kept: complex, before: complex, now: complex) -> Numeric:
+    from scipy.signal import lfilter  # takes long to load
+
     settled = (kept + before) * seen[..., :1]
     return np.asarray(lfilter([now, before], [1.0, -kept], seen, axis=-1, zi=settled)[0])
 
