@@ -199,7 +199,7 @@ def test_the_site_builds_without_a_warning_and_needs_no_network(tmp_path) -> Non
     """`make docs` without the pictures; strict: a broken link or a page outside the navigation fails."""
     import subprocess
 
-    pytest.importorskip("material", reason="mkdocs-material is not installed; pip install -r requirements-docs.lock")
+    pytest.importorskip("material", reason="mkdocs-material is not installed; pip install 'thermodrift[docs]'")
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")],
         cwd=ROOT, capture_output=True, text=True, check=False,

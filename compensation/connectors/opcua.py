@@ -12,7 +12,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
-from asyncua import Client, ua
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from compensation.connectors.messages import (
@@ -31,6 +30,13 @@ from compensation.contracts import Correction, Sample
 from data.errors import InputError, WorkError, closest
 from data.machine import Machine
 from data.yaml_file import load_yaml
+
+try:
+    from asyncua import Client, ua
+except ModuleNotFoundError as missing:
+    raise InputError(
+        f"opc.tcp: package {missing.name} is not installed; run pip install 'thermodrift[opcua]'"
+    ) from None
 
 SECRETS = "THERMODRIFT_OPCUA"
 _PORT = 4840

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from importlib.metadata import PackageNotFoundError, requires
 from importlib.metadata import version as installed
 from pathlib import Path
 from typing import Any, Literal, Protocol, get_args
@@ -632,7 +633,15 @@ def _example(stored: model_store.StoredModel, channels: Sequence[str]) -> pd.Dat
 def _requirements(family: Family) -> list[str]:
     """What a prediction needs; packages that only learning needs (`Family.packages`) are none of it."""
     packages = _SERVED_PACKAGES if family.has_program() else _MODEL_PACKAGES
-    return [f"{p}=={installed(p).partition('+')[0]}" for p in packages]
+    return [_pinned(p) for p in packages]
+
+
+def _pinned(package: str) -> str:
+    """The version here; of a package of an extra that is not installed, thermodrift's own range."""
+    try:
+        return f"{package}=={installed(package).partition('+')[0]}"
+    except PackageNotFoundError:
+        return next(r for r in requires("thermodrift") or () if r.startswith(package)).partition(";")[0].strip()
 
 
 CHALLENGER = "challenger"

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import socket
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -275,3 +276,11 @@ def test_a_wrong_node_file_is_one_clear_line(machine: Machine, tmp_path: Path, n
     with pytest.raises(InputError) as caught:
         open_source(f"opc.tcp://127.0.0.1:4840/plc?nodes={path}", machine)
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_missing_package_names_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "asyncua", None)
+    monkeypatch.delitem(sys.modules, "compensation.connectors.opcua")
+    machine = parse_machine(MACHINE, "m.yml")
+    with pytest.raises(InputError, match=r"opc\.tcp: package asyncua is not .*run pip install 'thermodrift\[opcua\]'"):
+        open_source("opc.tcp://127.0.0.1:1?nodes=nodes.yml", machine)

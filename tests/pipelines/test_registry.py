@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from mlflow.tracking import MlflowClient
 
 from compensation.faults import FaultCost
 from data.errors import InputError
+from models.families import FAMILIES
 from models.protocols import PromotionRule
 from models.selection.promotion import Choice, choose, decide
 from models.selection.trust import Region
@@ -385,3 +388,15 @@ def test_a_model_that_a_failed_sensor_can_ruin_is_no_champion_where_a_budget_say
     assert tags["worst_fault"] == "front: a drift of 1 K/h" and tags["worst_fault_um"] == "55.0"
     assert tags["sensor_um_per_K"] == '{"front": 9.0, "bed": 2.0}'
     assert load_model("models:/toy-dear-z@champion", store).info["faults"]["missed"] == 3
+
+
+def test_a_model_states_the_range_of_a_package_of_an_extra_that_is_not_installed(monkeypatch):
+    def installed(package):
+        if package == "onnxruntime":
+            raise PackageNotFoundError(package)
+        return "1.2+cpu"
+
+    monkeypatch.setattr(registry, "installed", installed)
+    stated = registry._requirements(FAMILIES["ridge"]())
+    assert stated[:3] == ["mlflow==1.2", "numpy==1.2", "pandas==1.2"]
+    assert re.fullmatch(r"onnxruntime[<>=.,\d]+", stated[3])
