@@ -269,7 +269,7 @@ def _per_batch(table: pd.DataFrame, column: str) -> pd.Series:
 
 
 def _detection_limits(table: pd.DataFrame) -> tuple[DetectionLimit, ...]:
-    """Every candidate's limit; nan where no amplitude within bounds would have been claimed."""
+    """Every candidate's limit; nan where no amplitude within bounds would be claimed."""
     return tuple(
         DetectionLimit(
             mechanism=mechanism, where=Place(kind=kind, name=name), words=words,

@@ -211,7 +211,7 @@ def _changed_values(text: str) -> list[tuple[int, int, list[str]]]:
 
 
 def limits_sentence(limits: Sequence[DetectionLimit]) -> str:
-    """Which displacement would have been claimed on each error channel, in the channel's unit; empty where none is known.
+    """Which displacement would be claimed on each error channel, in the channel's unit; empty where none is known.
 
     Of the mechanisms that move a channel by themselves, each at the driver or body where least is seen, the one that
     needs most is named. What acts through a temperature has its limit in another unit and stands in the table.
@@ -225,4 +225,4 @@ def limits_sentence(limits: Sequence[DetectionLimit]) -> str:
     for channel, own in sorted(least.items()):
         mechanism, (limit, unit) = max(own.items(), key=lambda item: item[1])
         said.append(f"on {channel} {tables.mechanism_label(mechanism)} from {three_digits(limit)} {unit}")
-    return f"Would have been claimed: {listed(said, MOST_PARAMETERS)}." if said else ""
+    return f"Would be claimed: {listed(said, MOST_PARAMETERS)}." if said else ""

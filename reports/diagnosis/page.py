@@ -180,7 +180,7 @@ def _limits(d: Diagnosis, pictures: bool) -> Section | None:
     first = own_best if len(own_best) else table[:_MOST_LIMITS]
     rest = table.drop(first.index)
     notes = (
-        "Of each mechanism the place where the least would have been claimed; the others below.",
+        "Of each mechanism the place where the least would be claimed; the others below.",
         "A smaller effect may be there: these recordings would not show it.",
     )
     folded = tables.limits(rest, d.simulated).folded() if len(rest) else None

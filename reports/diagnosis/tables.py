@@ -113,7 +113,7 @@ def below_headline(verdict: str, runs: int, limits: int) -> str:
     if verdict != "consistent":
         return ""
     text = f"In {count(runs, 'left-out run')} the simulation misses no more than noise and a coarse network leave"
-    return text + ("; an effect above the limits below would have been claimed." if limits else ".")
+    return text + ("; an effect above the limits below would be claimed." if limits else ".")
 
 
 def place_label(kind: str, name: str) -> str:
@@ -276,7 +276,7 @@ def _figure(value: Any) -> str:
 
 
 def limits(table: pd.DataFrame, simulated: bool) -> Table:
-    """The least effect that would have been claimed, per candidate, and what hides it."""
+    """The least effect that would be claimed, per candidate, and what hides it."""
     rows = []
     for r in table.to_dict("records"):
         limit, absorbed = _amplitude(r, "limit"), percent(float(r["absorbed"]))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from data.errors import InputError
+from models.families import FAMILIES as REGISTERED
 from models.protocols import PromotionRule
 from models.selection.crossing import Plan, prepare, refit
 from models.selection.grid import run_grid
@@ -121,3 +122,11 @@ def test_paired_differences_have_the_standard_error_of_their_mean() -> None:
 def test_a_stack_with_more_weights_than_members_is_refused() -> None:
     with pytest.raises(InputError, match="stack: got 1 members and 2 weights"):
         Stack([("mlr", ["a"])], [0.5, 0.5])
+
+
+def test_networks_enter_a_quick_race_only_where_they_are_named() -> None:
+    quick, usual = Plan(effort="quick").suited(None), Plan(effort="usual").suited(None)
+    late = {f for f in usual.families if "torch" in REGISTERED[f].packages}
+    assert late >= {"bp", "lstm", "gru", "tcn"} and set(usual.families) - set(quick.families) == late
+    assert {name for name, _ in quick.left_out} == {f"family {f}" for f in late} and not usual.left_out
+    assert Plan(families=("gru",), effort="quick").suited(None).families == ("gru",)

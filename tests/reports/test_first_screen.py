@@ -107,7 +107,7 @@ def test_consistent_states_what_would_have_been_seen_in_the_errors_unit() -> Non
     ]  # fmt: skip
     said = limits_sentence(limits)
     assert said == (
-        "Would have been claimed: on x slip in a bolted or guided joint from 0.795 µm and on z axial shift of the shaft "
+        "Would be claimed: on x slip in a bolted or guided joint from 0.795 µm and on z axial shift of the shaft "
         "with the speed from 7.22 µm."
     )
     assert limits_sentence(limits[-2:]) == ""

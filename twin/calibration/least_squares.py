@@ -210,7 +210,7 @@ def likelier(problem: Problem, one: State, other: State) -> State:
 
 
 def log_posterior(problem: Problem, state: State, noise: Noise, inflation: Array) -> float:
-    """Nats, up to a constant, of a state under the noise that it leaves; so many rows (c,) of a channel count as one."""
+    """Nats, up to a constant, under the noise that a state leaves; so many rows (c,) of a channel count as one."""
     rows = np.bincount(np.concatenate(state.channels), minlength=len(problem.channels)) / inflation
     priors = float(state.z @ state.z) + sum(float(v @ v) for v in state.nuisance)
     return -0.5 * (priors + float(np.sum(rows * np.log(noise.factor**2))))
