@@ -156,9 +156,9 @@ class Policy:
     unseen_start_sd: float = analytic(2.0, "sd", "by which a body without a sensor may start off")
     settled: int = cost(4, "refits", "the likeliest, compared under the covariance that is likeliest for each")
     claim_offset: float = development(
-        4.36, "log odds", "a logistic fit of 107 claims of 76 cases, 29 of them right: results/claims.csv"
+        4.17, "log odds", "a logistic fit of 91 claims of 52 cases, 24 of them right: results/claims.csv"
     )
-    claim_weight: float = development(1.27, "log odds", "of the same fit, for the logarithm of the relative gain")
+    claim_weight: float = development(1.23, "log odds", "of the same fit, for the logarithm of the relative gain")
     grown_min_probability: float = cost(0.25, "probability", "of an effect with which the next is looked for")
     claim_min_probability: float = convention(
         0.6, "probability", "a false claim costs half as much again as a missed one"
