@@ -239,7 +239,7 @@ def started(run: Run) -> pd.Timestamp:
 @cache
 def code_version() -> str:
     """The version of this program: ``git COMMIT`` of a checkout, -dirty with changes; else ``thermodrift VERSION``."""
-    root = Path(__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     if (root / ".git").exists():  # an installation inside another project's checkout has none of its own
         command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
         try:

@@ -4,6 +4,8 @@ import errno
 import json
 import os
 import platform
+import shutil
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +22,8 @@ from pipelines.settings import NamesPart, Settings
 from pipelines.store import audit, runs, tracking
 from tests.toys.tracked import log_training
 from tests.toys.training import toy_batches, toy_result
+
+ROOT = Path(__file__).resolve().parents[2]
 
 S_UM = {
     "none|zero|0": [9.0, 8.0, 10.0],
@@ -135,6 +139,15 @@ def test_a_run_says_who_made_it_with_which_program_and_in_which_process(logged, 
     assert (process["host"], process["pid"]) == (platform.node(), os.getpid())
     monkeypatch.setattr(sys, "argv", ["/somewhere/bin/thermodrift", "train", "--machine", "x.yml"])
     assert runs.origin()["mlflow.source.name"] == "thermodrift train"
+
+
+def test_a_checkout_is_known_by_its_commit():
+    if not (ROOT / ".git").exists() or shutil.which("git") is None:
+        pytest.skip("no checkout, or git is not installed")
+    said = subprocess.run(["git", "-C", str(ROOT), "rev-parse", "HEAD"], capture_output=True, text=True)
+    if said.returncode:
+        pytest.skip(f"git refuses this checkout: {said.stderr.strip()}")
+    assert runs.code_version().removesuffix("-dirty") == f"git {said.stdout.strip()}"
 
 
 def test_the_parent_carries_batches_figures_and_the_best(logged):
