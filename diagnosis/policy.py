@@ -150,6 +150,8 @@ class Policy:
     )
     label_swap_reweighting_rounds: int = cost(3, "rounds", "what no linear step can fit counts less")
 
+    usual_error_sd: float = analytic(2.0, "sd of an imperfection", "19 of 20 sensors and lengths are off by less")
+
     # Claims
     impossible_min_noises: float = analytic(5.0, "given noises", "by chance one row in two million is so far off")
     impossible_min_rows: int = convention(3, "rows", "a single one may be a fault of the recording")

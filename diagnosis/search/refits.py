@@ -11,13 +11,15 @@ import numpy as np
 
 from data.errors import InputError, WorkError
 from data.processes import Processes
+from diagnosis.candidates.discretisation import slack
 from diagnosis.candidates.priors import log_odds, starts
-from diagnosis.contracts import CandidateKind, Fitted, Scored, Tried
+from diagnosis.contracts import Candidate, CandidateKind, Fitted, Scored, Tried
 from diagnosis.fitting.fitted import refitted, relinearised
 from diagnosis.localisation.balance import impossible
 from diagnosis.policy import POLICY
 from diagnosis.screening.exchanged import suspected_swaps
 from diagnosis.screening.screen import Screen, likeness, one_of_each
+from twin.compile import own_paths
 from twin.mechanisms import MECHANISMS
 
 Progress = Callable[[str, int, int], None]  # receives the step, how many of it are done, and of how many
@@ -75,11 +77,11 @@ def refits(
     now: Fitted, seen: Screen, work: Sequence[Scored], odds: dict[str, float], workers: Processes, tell: Progress
 ) -> list[Tried]:
     """Those that can be simulated, the likeliest first."""
-    clusters = _clusters(now, seen, work)
+    clusters, sizes = _clusters(now, seen, work), slack([s.candidate for s in work], now)
     out = []
     for n, (s, fitted) in enumerate(zip(work, workers.map(partial(refit, now), work), strict=True)):
         tell("refit", n + 1, len(work))
-        if fitted is not None:
+        if fitted is not None and not _usual(s.candidate, fitted, sizes):
             c = s.candidate
             gain = fitted.log_evidence - now.log_evidence
             out.append(
@@ -106,6 +108,17 @@ def refit(now: Fitted, s: Scored) -> Fitted | None:
         except (InputError, WorkError):
             continue
     return None
+
+
+def _usual(c: Candidate, fitted: Fitted, sizes: Mapping[str, float]) -> bool:
+    """Whether it is an error that any sensor or length may have (`candidates.discretisation`), of no more than its usual
+    size: one that is larger than the others is no physics yet."""
+    if c.name not in sizes or c.part is None:
+        return False
+    most = POLICY.usual_error_sd * sizes[c.name]
+    own, parameters = own_paths(fitted.machine, fitted.part), fitted.problem.network.parameters
+    values = {own.get(p.name, p.name): v for p, v in zip(parameters, fitted.values.tolist(), strict=True)}
+    return all(abs(values[f"mechanisms.{c.name}.{a}"] - off) <= most for a, off in c.amplitudes.items())
 
 
 def _clusters(now: Fitted, seen: Screen, work: Sequence[Scored]) -> dict[str, str]:
