@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,16 +12,19 @@ import pytest
 from data.batch import Batch
 from data.errors import InputError
 from data.processes import Processes
-from diagnosis.candidates.discretisation import never_reported
+from diagnosis.candidates.discretisation import never_reported, slack
 from diagnosis.fitting.fitted import left_out_rows, plain, worsened
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import proposed
+from diagnosis.search import refits as refits_module
 from diagnosis.search import search as search_module
 from diagnosis.search.claims import Round
 from diagnosis.search.search import Search, decided, one_round, search, without
 from tests.diagnosis.small_cases import DRIFT, FLOOR, SHIFT, fitted, runs, two_bodies
 from twin.calibration.identifiability import Interval, intervals90
 from twin.calibration.least_squares import result
+from twin.compile import compile_network
+from twin.quantity import Value
 
 COUNT = 8
 COLD = {**FLOOR, "parameters": {"conductance": "8 W/K"}}
@@ -126,6 +130,24 @@ def test_what_a_refit_would_keep_without_its_effect_is_no_gain() -> None:
     again = decided(replace(r, before=short))
     assert again.before.log_evidence > r.before.log_evidence - 1 and again.best is not None and r.best is not None
     assert again.best.gain == pytest.approx(r.best.gain, abs=2.0)
+
+
+@pytest.mark.parametrize("sd", [1.9, 2.1])
+def test_what_any_sensor_or_length_may_be_off_by_is_no_effect(sd: float) -> None:
+    now = found("nothing").baseline
+    every = [c for c in proposed(now) if c.part is not None]
+    sizes = slack(every, now)
+    judged = [c for c in every if c.name in sizes]
+    assert {c.mechanism for c in judged} >= {"sensor_bonding", "sensor_lag", "sensor_offset"}
+    for c in judged:
+        ((name, off),) = c.amplitudes.items()
+        by = sd * sizes[c.name] * (-1.0 if c.mechanism == "sensor_bonding" else 1.0)
+        part = c.applied(now.part, {name: Value(value=off + by)})
+        network = compile_network(now.machine, part=part)
+        fit = SimpleNamespace(
+            machine=now.machine, part=part, problem=SimpleNamespace(network=network), values=network.values
+        )
+        assert refits_module._usual(c, fit, sizes) is (sd < POLICY.usual_error_sd), c.name  # type: ignore[arg-type]
 
 
 def test_what_was_accepted_can_be_taken_out_again() -> None:
