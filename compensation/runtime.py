@@ -18,7 +18,7 @@ import numpy as np
 
 from compensation import safety
 from compensation.contracts import Correction, Sample
-from compensation.safety import Axis, Limits
+from compensation.safety import ENDS, NEW_RUN_S, STOPPED, Axis, Limits, SampleClock
 from compensation.substitutes import Guard, Substitutes, Watch
 from data.arrays import Array
 from data.errors import InputError
@@ -29,13 +29,13 @@ from models.selection.trust import SLACK, Region
 from models.selection.updating import State as Learned
 from models.selection.updating import Updater
 
-SCHEMA = "thermodrift.compensation/1"
+SCHEMA = "thermodrift.compensation/2"
 _ODD_READING_SD = 4.0  # of what the filter expects: beyond it a reading is a failed probing, not thermal error
 _MOST_BOUNDS = 5.0  # times what nine in ten runs stay below: no machine changes so much between two readings
 _INTERVALS = 20  # of samples, whose median is how often they arrive
 _LOST_SAMPLES = 5  # in a row are silence
 _LEAST_UM2 = 1e-12  # a variance of rounding alone
-_NEW_RUN_S = 4 * 3600.0  # of silence: the machine has cooled down unseen, so that the model starts again at 0
+_MOST_BEATS = 2**31  # what a counter of a control holds
 _MM_PER_M = 1000.0
 
 
@@ -149,10 +149,11 @@ class Compensator:
         self._inputs = {a.axis: _inputs_of(a) for a in axes}
         self._wanted = tuple(dict.fromkeys(c for a in axes for c in a.program.channels))
         self._run = {a.axis: self._fresh(a) for a in axes}
-        self._grid_s: float | None = None  # time stamp of the grid's last row
-        self._restored = False  # and no sample has come since
+        self.stopped = False  # by the operator
+        self._clock = SampleClock()
+        self._grid_s: float | None = None  # time of the grid's last row: a time stamp less `SampleClock.shift_s`
         self._held: dict[str, float] = {}
-        self._arrived_s: dict[str, float] = {}  # time stamp at which each channel last had a value
+        self._arrived_s: dict[str, float] = {}  # when each channel last had a value
         self._patience_s = max(a.limits.stale_s for a in axes)
         self.rejected = 0
         self._intervals_s: deque[float] = deque(maxlen=_INTERVALS)  # between samples, on the monotonic clock
@@ -193,17 +194,21 @@ class Compensator:
 
         A sample without values only brings readings.
         """
-        if not sample.values:
-            for axis, measured_um in sample.readings_um.items():
-                self._read(axis, measured_um)
+        if not sample.values or sample.time_s == self._clock.last_s:  # one that is repeated is no new sample
+            self._read_all(sample)
             return self.silence(clock_s, sample.time_s)
         if self._last_clock_s is not None and clock_s > self._last_clock_s:
             self._intervals_s.append(clock_s - self._last_clock_s)
             self._limits = self._limits_now()
-        self._last_clock_s = clock_s
-        fault, notes = self._advance(sample)
-        for axis, measured_um in sample.readings_um.items():
-            self._read(axis, measured_um)
+        self._last_clock_s = clock_s if math.isfinite(clock_s) else self._last_clock_s
+        narrowest = min(self._limits.values(), key=lambda limits: limits.stale_s)
+        self._clock, fault = self._clock.judged(narrowest, self._last_clock_s or 0.0, sample.time_s)
+        notes = ""
+        if fault is None:  # no other sample moves the models
+            fault, notes = self._advance(sample.values, sample.time_s - self._clock.shift_s)
+            self._read_all(sample)
+        elif sample.readings_um:
+            self.log(f"reading of {', '.join(sample.readings_um)} not used: {fault}")
         wanted = {}
         for a in self.axes:
             run = self._run[a.axis]
@@ -211,19 +216,26 @@ class Compensator:
         return self._sent(
             sample.time_s,
             lambda a, was, k: safety.step(
-                was, self._limits[a.axis], clock_s, sample.time_s, wanted[a.axis][k], self._run[a.axis].trust, fault
+                was, self._limits[a.axis], clock_s, wanted[a.axis][k], self._run[a.axis].trust, fault, self._stop
             ),
             notes,
         )
 
     def silence(self, clock_s: float, time_s: float) -> Correction:
         """The correction while nothing arrives; `time_s` is stamped on it."""
-        return self._sent(time_s, lambda a, was, k: safety.silence(was, self._limits[a.axis], clock_s))
+        return self._silent(clock_s, time_s, self._stop)
+
+    def end(self, clock_s: float, time_s: float) -> Correction:
+        """The correction while the compensation ends: every axis fades out. No stop: a restart begins with warm-up."""
+        return self._silent(clock_s, time_s, self._stop or ENDS)
+
+    def _silent(self, clock_s: float, time_s: float, stop: str) -> Correction:
+        return self._sent(time_s, lambda a, was, k: safety.silence(was, self._limits[a.axis], clock_s, stop))
 
     def fault(self, clock_s: float, time_s: float, why: str) -> Correction:
         """The correction where nothing else can be computed: every axis holds what it has, and fades after hold_s."""
         return self._sent(
-            time_s, lambda a, was, k: safety.step(was, self._limits[a.axis], clock_s, time_s, 0.0, 1.0, why)
+            time_s, lambda a, was, k: safety.step(was, self._limits[a.axis], clock_s, 0.0, 1.0, why, self._stop)
         )
 
     def _limits_now(self) -> dict[str, Limits]:
@@ -234,14 +246,16 @@ class Compensator:
         return {a.axis: replace(a.limits, stale_s=own_s) if own_s < a.limits.stale_s else a.limits for a in self.axes}
 
     def stop(self) -> None:
-        """The operator stops: every axis fades out."""
-        for run in self._run.values():
-            run.safety, run.slope_safety = safety.stop(run.safety), safety.stop(run.slope_safety)
+        """The operator stops: every axis fades out and stays off, also after a restart."""
+        self.stopped = True
 
     def start(self) -> None:
         """The operator ends a stop: every axis becomes active after warm-up."""
-        for run in self._run.values():
-            run.safety, run.slope_safety = safety.start(run.safety), safety.start(run.slope_safety)
+        self.stopped = False
+
+    @property
+    def _stop(self) -> str:
+        return STOPPED if self.stopped else ""
 
     def _sent(
         self, time_s: float, step: Callable[[AxisModel, Axis, int], tuple[Axis, float, str]], notes: str | None = None
@@ -261,43 +275,36 @@ class Compensator:
             behind_um = run.safety.behind_um
             limited = f"rate limited: {behind_um:.3g} um behind" if behind_um > self._limits[a.axis].step_um else ""
             reasons[a.axis] = "; ".join(r for r in (reason, limited, why, notes, a.remark) if r)
-        self._heartbeat += 1
+        self._heartbeat = (self._heartbeat + 1) % _MOST_BEATS
         until_s = time_s + min(self._limits[a.axis].stale_s for a in self.axes)
         return Correction(time_s, offset, slope, state, reasons, self._heartbeat, until_s)
 
-    def _check_clock(self, time_s: float) -> None:
-        """After a restart: a state from the future belongs to a clock that was set back, and no time since is known."""
-        self._restored = False
-        if self._grid_s is not None and (behind_s := self._grid_s - time_s) > self._patience_s:
-            self.log(f"the clock is {behind_s / 3600:.1f} h behind the saved state: a new run begins")
+    def _advance(self, given: Mapping[str, float], time_s: float) -> tuple[str | None, str]:
+        """Takes the models to the time of a sample: why it cannot be used, and what was replaced in it."""
+        since_s = 0.0 if self._grid_s is None else time_s - self._grid_s
+        if since_s < -self._patience_s:
+            self.log(f"the clock is {-since_s / 3600:.1f} h behind the saved state: a new run begins")
             self.confirm(levels=True)
-
-    def _advance(self, sample: Sample) -> tuple[str | None, str]:
-        """Takes the models to the time of the sample: why it cannot be used, and what was replaced in it."""
-        if not math.isfinite(sample.time_s):
-            return None, ""  # the state machine refuses the time stamp
-        if self._restored:
-            self._check_clock(sample.time_s)
-        values, fault, notes = dict(sample.values), None, ""
+        values, fault, notes = dict(given), None, ""
         if self.guard is not None and self._watch is not None:
-            self._watch, checked = self.guard.step(self._watch, sample.time_s, sample.values)
+            self._watch, checked = self.guard.step(self._watch, time_s, given)
             values, fault, notes = dict(checked.values), checked.fault, checked.reason
         clean = {c: float(v) for c, v in values.items() if v is not None and math.isfinite(v)}
-        self._arrived_s |= dict.fromkeys(clean, sample.time_s)
-        if fault is None and self._grid_s is not None and (lost := self._lost(sample.time_s)):
+        self._arrived_s |= dict.fromkeys(clean, time_s)
+        if fault is None and self._grid_s is not None and (lost := self._lost(time_s)):
             fault = f"lost: {', '.join(lost)}"  # channels that no regression replaces
         if fault is not None:
             return fault, notes
-        if self._grid_s is not None and sample.time_s - self._grid_s > _NEW_RUN_S:
-            self.log(f"silent for {(sample.time_s - self._grid_s) / 3600:.1f} h: a new run begins")
+        if since_s > NEW_RUN_S:
+            self.log(f"silent for {since_s / 3600:.1f} h: a new run begins")
             self.begin_run()
         if self._grid_s is None:
             self._held = clean
             if missing := self._missing(clean):
                 return f"not yet seen: {', '.join(missing)}", notes
-            self._rows(sample.time_s, [clean])
+            self._rows(time_s, [clean])
             return None, notes
-        rows = int((sample.time_s - self._grid_s) / self.period_s + 1e-9)
+        rows = int((time_s - self._grid_s) / self.period_s + 1e-9)
         if rows > 0:
             whole = {**self._held, **clean}
             shares = (np.arange(rows) + 1) / rows  # a longer gap is bridged by a straight line
@@ -335,6 +342,10 @@ class Compensator:
     def _scaled(self, a: AxisModel, seen: Array, predicted_um: float) -> Array:
         places, scale = self._inputs[a.axis]
         return seen[places] / scale if a.inputs else np.array([predicted_um])
+
+    def _read_all(self, sample: Sample) -> None:
+        for axis, measured_um in sample.readings_um.items():
+            self._read(axis, measured_um)
 
     def _read(self, axis: str, measured_um: float) -> None:
         """A reading of the error that is left with the correction that is being sent."""
@@ -376,8 +387,8 @@ class Compensator:
         run.error_um, _, _ = a.updater.step(run.learned, *row)
 
     def as_plain(self) -> dict[str, Any]:
-        """Everything that a restart needs, numbers, strings and lists."""
-        axes, sent = {}, self.sent()
+        """Everything that a restart needs, numbers, strings and lists; `heartbeat` is the record's number."""
+        axes = {}
         for name, run in self._run.items():
             learned = run.learned and {
                 "mean": run.learned.mean.tolist(), "cov": run.learned.cov.tolist(), "time_s": run.learned.time_s,
@@ -385,14 +396,14 @@ class Compensator:
             }  # fmt: skip
             axes[name] = {
                 "model": run.model.as_plain(), "region": run.region.as_plain(), "learned": learned,
-                **sent[name],
                 "error_um": _or_none(run.error_um),
                 "free_um": _or_none(run.free_um), "scaled": [_or_none(v) for v in run.scaled.tolist()],
                 "slope_um_per_mm": _or_none(run.slope_um_per_mm), "trust": run.trust, "at_s": run.at_s,
             }  # fmt: skip
         watch = self._watch.as_plain() if self._watch is not None else None
-        return {"schema": SCHEMA, "machine": self.machine, "period_s": self.period_s, "grid_s": self._grid_s,
-                "held": self._held, "watch": watch, "axes": axes}  # fmt: skip
+        return {"schema": SCHEMA, "machine": self.machine, "heartbeat": self._heartbeat, "stopped": self.stopped,
+                "sent": self.sent(), "period_s": self.period_s, "grid_s": self._grid_s,
+                "shift_s": self._clock.shift_s, "held": self._held, "watch": watch, "axes": axes}  # fmt: skip
 
     def sent(self) -> dict[str, Any]:
         """What a restart needs to go on from what was sent, by axis."""
@@ -400,32 +411,36 @@ class Compensator:
             n: {"safety": r.safety.as_plain(), "slope_safety": r.slope_safety.as_plain()} for n, r in self._run.items()
         }
 
-    def restore_sent(self, plain: Mapping[str, Any]) -> None:
-        """Goes on from `sent` of another process, whatever is known of its models.
-
-        Raises:
-            InputError: a state that is unknown, or a number that is not finite.
-        """
-        known = {
-            n: (Axis.from_plain(plain[n]["safety"]), Axis.from_plain(plain[n]["slope_safety"]))
-            for n in self._run if n in plain
-        }  # fmt: skip
-        for name, (offset, slope) in known.items():
-            self._run[name].safety, self._run[name].slope_safety = offset, slope
-
     def restore(self, plain: Mapping[str, Any]) -> None:
-        """Goes on from `as_plain` of another process: what was learned is kept, what is sent does not jump.
+        """Goes on from `as_plain` of another process: what is sent does not jump, what was learned is kept.
+
+        What was sent and a stop by the operator are taken over also where the models are others and the rest is not.
 
         Raises:
             InputError: the state of another machine, period or set of axes.
         """
-        got = (plain.get("schema"), plain.get("machine"), plain.get("period_s"), sorted(plain.get("axes", ())))
-        expected = (SCHEMA, self.machine, self.period_s, sorted(self._run))
+        got = plain.get("schema"), plain.get("machine"), plain.get("period_s"), sorted(plain.get("axes", ()))
+        expected = SCHEMA, self.machine, self.period_s, sorted(self._run)
+        if got[:2] == expected[:2]:
+            self._restore_sent(plain)
         if got != expected:
             raise InputError(
                 f"state of a compensation: got {got}, expected {expected}; delete the file, the compensation then "
                 "starts afresh"
             )
+        self._restore_models(plain)
+
+    def _restore_sent(self, plain: Mapping[str, Any]) -> None:
+        sent = plain["sent"]
+        known = {
+            n: (Axis.from_plain(sent[n]["safety"]), Axis.from_plain(sent[n]["slope_safety"]))
+            for n in self._run if n in sent
+        }  # fmt: skip
+        for name, (offset, slope) in known.items():
+            self._run[name].safety, self._run[name].slope_safety = offset, slope
+        self.stopped, self._heartbeat = bool(plain["stopped"]), int(plain["heartbeat"])
+
+    def _restore_models(self, plain: Mapping[str, Any]) -> None:
         runs = {}
         for name, one in plain["axes"].items():
             kept = one["learned"]
@@ -434,7 +449,7 @@ class Compensator:
             )
             runs[name] = _Running(
                 State.from_plain(one["model"]), State.from_plain(one["region"]), learned,
-                Axis.from_plain(one["safety"]), Axis.from_plain(one["slope_safety"]),
+                self._run[name].safety, self._run[name].slope_safety,
                 _or_nan(one["error_um"]), _or_nan(one["free_um"]),
                 np.array([_or_nan(v) for v in one["scaled"]]), _or_nan(one["slope_um_per_mm"]), float(one["trust"]),
                 at_s=float(one["at_s"]),
@@ -443,7 +458,9 @@ class Compensator:
         watch = (
             Watch.from_plain(plain["watch"]) if self.guard is not None and plain["watch"] is not None else self._watch
         )
-        self._run, self._held, self._watch, self._grid_s, self._restored = runs, held, watch, plain["grid_s"], True
+        grid_s, shift_s = plain["grid_s"], float(plain["shift_s"])
+        self._clock = SampleClock(None if grid_s is None else grid_s + shift_s, shift_s)
+        self._run, self._held, self._watch, self._grid_s = runs, held, watch, grid_s
 
 
 def _inputs_of(a: AxisModel) -> tuple[list[int], Array]:

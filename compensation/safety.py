@@ -10,15 +10,15 @@ output by at most
     min(rate_um_per_s · min(max(Δclock_s, 0), stale_s), step_um),
 
 so no time stamp of a sample can buy a larger step, and neither can a pause of the runtime. The time stamps of the
-samples (`time_s`) only decide whether a sample is used. `compensation.core` has the transitions and the movement; this
-module judges time stamps, and says why an axis does not act.
+samples (`time_s`) only decide whether a sample is used, and when it was taken (`SampleClock`). `compensation.core` has
+the transitions and the movement; this module says why an axis does not act.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from math import inf, isfinite
+from dataclasses import dataclass, replace
+from math import isfinite
 from typing import Any, Literal, Self, get_args
 
 from compensation import core
@@ -30,6 +30,8 @@ STATES: tuple[State, ...] = get_args(State)  # the core numbers them from 0
 _NUMBER = {state: float(number) for number, state in enumerate(STATES)}
 
 STOPPED = "stopped by the operator"
+ENDS = "the compensation ends"
+NEW_RUN_S = 4 * 3600.0  # of silence: the machine has cooled down unseen, so that a model starts again at 0
 _CLOCK_DRIFT = 1e-3  # s per s that two healthy clocks may differ: a quartz stays below 1e-4
 
 
@@ -75,23 +77,65 @@ class Limits:
 
 @dataclass(frozen=True)
 class SampleClock:
-    """What is known of the clock of the samples; a restart forgets it.
+    """The clock of the samples against the monotonic one, which alone decides about age and order.
 
     Attributes:
-        newest_s: time stamp of the newest sample used, s.
+        newest_s: time stamp of the newest sample used, s; after a restart that of the saved state.
+        shift_s: how far this clock was set since the run began, s: `time_s - shift_s` goes on where it was set.
         last_s: time stamp of the sample that arrived last, used or not, s.
-        lead_s: time stamp less monotonic clock of the freshest samples, s: the age of a sample is what it lacks.
+        lead_s: time stamp less monotonic clock of the freshest samples, s: the age of a sample is what it lacks. A
+            restart forgets it, since a monotonic clock has another origin in another process.
         other_s: lead of samples that disagree with `lead_s`, s, None while none does.
         other_for_s: how long samples have agreed with `other_s`, s.
         last_clock_s: monotonic clock when the last sample arrived, s.
     """
 
     newest_s: float | None = None
+    shift_s: float = 0.0
     last_s: float | None = None
     lead_s: float | None = None
     other_s: float | None = None
     other_for_s: float = 0.0
     last_clock_s: float | None = None
+
+    def judged(self, limits: Limits, clock_s: float, time_s: float) -> tuple[Self, str | None]:
+        """The clock after one more sample, and why its time stamp cannot be used; None where it can.
+
+        A stamp is not used where it is older than the newest one or disagrees with the monotonic clock by more than
+        stale_s: the clock of the samples has jumped, or the sample is old. Another clock is accepted once samples agree
+        with it for warm_up_s, and the first sample after a restart at once where the saved state may be that old, else
+        with the second.
+        """
+        lead_s = time_s - clock_s
+        if not isfinite(lead_s):
+            return self, f"clock: the time stamp of the sample is {time_s}"
+        since_s = 0.0 if self.last_clock_s is None else max(clock_s - self.last_clock_s, 0.0)
+        later = self.last_s is None or time_s > self.last_s
+        seen = replace(self, last_s=time_s, last_clock_s=clock_s)
+        since_newest_s = 0.0 if self.newest_s is None else time_s - self.newest_s
+        taken = replace(seen, newest_s=time_s, lead_s=lead_s, other_s=None, other_for_s=0.0)
+        if self.lead_s is None:
+            if -limits.stale_s <= since_newest_s <= NEW_RUN_S:  # a little behind goes on from the saved state
+                return replace(taken, shift_s=self.shift_s + min(since_newest_s, 0.0)), None
+            jump_s, agree_s, whose = since_newest_s, 0.0, "saved state"
+        else:
+            jump_s, agree_s, whose = lead_s - self.lead_s, limits.warm_up_s, "clock so far"
+            if abs(jump_s) <= limits.stale_s and since_newest_s >= -limits.stale_s:
+                if since_newest_s <= 0.0:
+                    return seen, f"clock: the sample is {-since_newest_s:.3g} s older than the newest one"
+                # The lead follows fresher samples at once and older ones no faster than clocks drift, so that a source
+                # that falls behind little by little is noticed.
+                leads_s = max(lead_s, self.lead_s - _CLOCK_DRIFT * min(since_s, limits.stale_s))
+                return replace(taken, lead_s=leads_s), None
+        agrees = self.other_s is not None and abs(lead_s - self.other_s) <= limits.stale_s
+        again = agrees and later and since_s <= limits.stale_s
+        other_for_s = self.other_for_s + since_s if again else 0.0
+        if again and other_for_s >= agree_s:
+            set_s = 0.0 if self.lead_s is None else lead_s - self.lead_s
+            return replace(taken, shift_s=self.shift_s + set_s), None
+        seen = replace(seen, other_s=self.other_s if again else lead_s, other_for_s=other_for_s)
+        off_s = jump_s if abs(jump_s) > limits.stale_s else since_newest_s
+        return seen, f"clock: the sample is {abs(off_s):.0f} s {'ahead of' if off_s > 0 else 'behind'} the {whose}"
 
 
 @dataclass(frozen=True)
@@ -102,27 +146,23 @@ class Axis:
         state: one of `STATES`.
         sent_um: offset sent last, µm.
         reason: why the axis is not active, or acts with reduced authority; empty where it is and does not.
-        stopped: an operator has stopped the axis; `start` ends that, a restart does not.
         held_s: time in `hold` since the axis was active, s.
         target_um: where an active axis moves to, µm, |target| ≤ max_offset_um.
         warmed: the input was valid for warm_up_s and the axis has not faded out since.
         good_s: how long the input has been valid without a break, s; None after an input that was not.
         quiet_s: time since the last valid input, s.
         clock_s: monotonic clock of the last step, s.
-        samples: the clock of the samples.
     """
 
     state: State = "off"
     sent_um: float = 0.0
     reason: str = "no valid sample so far"
-    stopped: bool = False
     held_s: float = 0.0
     target_um: float = 0.0
     warmed: bool = False
     good_s: float | None = None
     quiet_s: float = 0.0
     clock_s: float | None = None
-    samples: SampleClock = field(default_factory=SampleClock)
 
     @property
     def behind_um(self) -> float:
@@ -132,14 +172,13 @@ class Axis:
 
     def as_plain(self) -> dict[str, Any]:
         """Numbers and strings: what a restart needs."""
-        return {"state": self.state, "sent_um": self.sent_um, "stopped": self.stopped, "held_s": self.held_s}
+        return {"state": self.state, "sent_um": self.sent_um, "held_s": self.held_s}
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> Self:
         """The axis after a restart: it continues from the offset sent last and passes warm-up again.
 
-        The time held counts on, so that restarts do not prolong `hold`. Both clocks are forgotten: a monotonic clock
-        has another origin in another process.
+        The time held counts on, so that restarts do not prolong `hold`.
 
         Raises:
             InputError: an unknown state, or a number that is not finite.
@@ -151,23 +190,21 @@ class Axis:
                 f"state of an axis: got sent_um={sent_um!r}, held_s={held_s!r}, expected finite numbers; delete the "
                 "stored state and set the offset of the control to 0"
             )
-        stopped = bool(plain["stopped"])
-        reason = STOPPED if stopped else "restarted"
         if sent_um == 0.0:
             state = "off"
         elif state != "fade-out":
-            state = "fade-out" if stopped else "warm-up"
-        return cls(state=state, sent_um=sent_um, reason=reason, stopped=stopped, held_s=max(held_s, 0.0))
+            state = "warm-up"
+        return cls(state=state, sent_um=sent_um, reason="restarted", held_s=max(held_s, 0.0))
 
 
 def step(
     axis: Axis,
     limits: Limits,
     clock_s: float,
-    time_s: float,
     wanted_um: float,
     trust: float = 1.0,
     fault: str | None = None,
+    stop: str = "",
 ) -> tuple[Axis, float, str]:
     """One sample: the state after it, the offset to send, µm, and the reason where the axis does not act fully.
 
@@ -175,55 +212,37 @@ def step(
     the bound in the head of this module. Where a restart brings a smaller max_offset_um, the offset returns into it at
     the limited rate, as a jump would do more harm.
 
-    A sample is not used, and the axis holds, where `fault` is given, where `wanted_um` or `trust` is not a number, and
-    where its time stamp is older than the newest one or disagrees with the monotonic clock by more than stale_s: the
-    clock of the samples has jumped, or the sample is old. A new clock is accepted once samples agree with it for
-    warm_up_s. A repeated time stamp is no new sample: it counts as silence.
+    A sample is not used, and the axis holds, where `fault` is given, and where `wanted_um` or `trust` is not a number.
 
     Args:
         axis: state before.
         limits: of this axis.
         clock_s: monotonic clock of the runtime, s, any origin.
-        time_s: time stamp of the sample, s, any origin.
         wanted_um: offset that the model requests, µm.
         trust: authority of the model, clipped to [0, 1]; multiplies `wanted_um`.
         fault: why the sample or the model cannot be used; None where it can.
+        stop: why the axis fades out and stays off; empty where it does not.
     """
-    if fault is None and time_s == axis.samples.last_s:
-        return silence(axis, limits, clock_s)
-    at_s = clock_s if isfinite(clock_s) else axis.clock_s or 0.0
-    samples, problem = _judged(axis.samples, limits, at_s, time_s)
+    problem = fault
     if fault is not None:
         problem = fault or "unnamed fault"
-    elif problem is None and not isfinite(wanted_um):
+    elif not isfinite(wanted_um):
         problem = f"the model requests {wanted_um} µm"
-    elif problem is None and trust != trust:
+    elif trust != trust:
         problem = "the trust in the model is not a number"
-    axis = replace(axis, samples=samples)
     if problem is not None:
-        return _moved(axis, limits, clock_s, faulty=True, reason=problem)
-    return _moved(axis, limits, clock_s, wanted_um, min(max(trust, 0.0), 1.0))
+        return _moved(axis, limits, clock_s, faulty=True, reason=problem, stop=stop)
+    return _moved(axis, limits, clock_s, wanted_um, min(max(trust, 0.0), 1.0), stop=stop)
 
 
-def silence(axis: Axis, limits: Limits, clock_s: float) -> tuple[Axis, float, str]:
+def silence(axis: Axis, limits: Limits, clock_s: float, stop: str = "") -> tuple[Axis, float, str]:
     """No sample has arrived until `clock_s`: returns as `step`.
 
     Within stale_s an active axis goes on towards its target; then it holds, fades out and is off.
     """
     known = axis.state not in ("active", "warm-up") and axis.reason
     reason = axis.reason if known else f"no valid sample for more than {limits.stale_s:g} s"
-    return _moved(axis, limits, clock_s, reason=reason)
-
-
-def stop(axis: Axis) -> Axis:
-    """The operator stops the axis: it fades out from the next step on and stays off, until `start`."""
-    state: State = "fade-out" if axis.sent_um else "off"
-    return replace(axis, state=state, stopped=True, reason=STOPPED, warmed=False, good_s=None, held_s=0.0)
-
-
-def start(axis: Axis) -> Axis:
-    """The operator ends a stop: the axis becomes active after warm_up_s of valid input."""
-    return replace(axis, stopped=False, reason="started by the operator") if axis.stopped else axis
+    return _moved(axis, limits, clock_s, reason=reason, stop=stop)
 
 
 def _moved(
@@ -234,18 +253,21 @@ def _moved(
     trust: float = 1.0,
     faulty: bool = False,
     reason: str = "",
+    stop: str = "",
 ) -> tuple[Axis, float, str]:
     """One step of the core: with a usable sample where `wanted_um` is given, else `reason` says why there is none."""
     now_s = clock_s if isfinite(clock_s) else axis.clock_s
     elapsed_s = 0.0 if axis.clock_s is None or now_s is None else now_s - axis.clock_s
     asked_um = 0.0 if wanted_um is None else float(trust * wanted_um)
-    inputs = (elapsed_s, asked_um, float(wanted_um is not None), float(faulty), float(axis.stopped),
+    inputs = (elapsed_s, asked_um, float(wanted_um is not None), float(faulty), float(bool(stop)),
               *(getattr(limits, name) for name in core.LIMITS))  # fmt: skip
     good_s = -1.0 if axis.good_s is None else axis.good_s
     number, sent_um, held_s, target_um, warmed, good_s, quiet_s = core.run()(
         inputs, _NUMBER[axis.state], axis.sent_um, axis.held_s, axis.target_um, float(axis.warmed), good_s, axis.quiet_s
     )
-    if axis.stopped or (wanted_um is None and not faulty and quiet_s <= limits.stale_s):
+    if stop:
+        reason = stop
+    elif wanted_um is None and not faulty and quiet_s <= limits.stale_s:
         reason = axis.reason
     elif wanted_um is not None and not warmed:
         reason = f"valid input for {good_s:.0f} s of {limits.warm_up_s:.0f} s"
@@ -254,36 +276,6 @@ def _moved(
         if target_um != asked_um:
             notes.append(f"request of {asked_um:.4g} µm limited to {target_um:.4g} µm")
         reason = "; ".join(notes)
-    axis = Axis(STATES[int(number)], sent_um, reason, axis.stopped, held_s, target_um, bool(warmed),
-                None if good_s < 0.0 else good_s, quiet_s, now_s, axis.samples)  # fmt: skip
+    axis = Axis(STATES[int(number)], sent_um, reason, held_s, target_um, bool(warmed),
+                None if good_s < 0.0 else good_s, quiet_s, now_s)  # fmt: skip
     return axis, sent_um, reason
-
-
-def _judged(samples: SampleClock, limits: Limits, clock_s: float, time_s: float) -> tuple[SampleClock, str | None]:
-    """The clock of the samples after one more, and why its time stamp cannot be used."""
-    lead_s = time_s - clock_s
-    if not isfinite(lead_s):
-        return samples, f"clock: the time stamp of the sample is {time_s}"
-    since_s = 0.0 if samples.last_clock_s is None else max(clock_s - samples.last_clock_s, 0.0)
-    later = samples.last_s is None or time_s > samples.last_s
-    seen = replace(samples, last_s=time_s, last_clock_s=clock_s)
-    if samples.lead_s is None:
-        return replace(seen, newest_s=time_s, lead_s=lead_s), None
-    jump_s = lead_s - samples.lead_s
-    behind_s = -inf if samples.newest_s is None else samples.newest_s - time_s
-    if abs(jump_s) <= limits.stale_s and behind_s <= limits.stale_s:
-        if behind_s >= 0:
-            return seen, f"clock: the sample is {behind_s:.3g} s older than the newest one"
-        # The lead follows fresher samples at once and older ones no faster than clocks drift, so that a source that
-        # falls behind little by little is noticed.
-        leads_s = max(lead_s, samples.lead_s - _CLOCK_DRIFT * min(since_s, limits.stale_s))
-        return replace(seen, newest_s=time_s, lead_s=leads_s, other_s=None, other_for_s=0.0), None
-    agrees = samples.other_s is not None and abs(lead_s - samples.other_s) <= limits.stale_s
-    if not (agrees and later and since_s <= limits.stale_s):
-        seen = replace(seen, other_s=lead_s, other_for_s=0.0)
-    else:
-        seen = replace(seen, other_for_s=samples.other_for_s + since_s)
-        if seen.other_for_s >= limits.warm_up_s:
-            return replace(seen, newest_s=time_s, lead_s=lead_s, other_s=None, other_for_s=0.0), None
-    off_s = jump_s if abs(jump_s) > limits.stale_s else -behind_s
-    return seen, f"clock: the sample is {abs(off_s):.3g} s {'ahead of' if off_s > 0 else 'behind'} the clock so far"

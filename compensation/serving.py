@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -17,79 +18,67 @@ from compensation.runtime import Compensator
 from data.errors import InputError, WorkError
 from data.files import write_atomic
 
-_SAVED_EVERY_S = 30.0  # what a power cut may lose of what was learned
+_SAVED_EVERY_S = 30.0  # what a power cut may lose of what was learned while what is sent does not change
 _FADE_STEP_S = 1.0  # between two corrections while a stop fades
 
 
 class StateFile:
-    """The state of a compensation on disk, replaced atomically, with a checksum.
-
-    What is sent is written ahead to a second, small file, so that a restart after a crash goes on from it.
-    """
+    """All that a restart needs, in one record that is replaced atomically, with a checksum."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.ahead = path, path.with_suffix(".sent")
+        self.path = path
 
-    def load(self, log: Callable[[str], None] = print) -> dict[str, Any]:
-        """`state` and `sent`, as far as they can be read; a file that cannot is set aside with one line."""
-        return {
-            name: plain
-            for name, path in (("state", self.path), ("sent", self.ahead))
-            if (plain := self._read(path, log)) is not None
-        }
-
-    def _read(self, path: Path, log: Callable[[str], None]) -> Mapping[str, Any] | None:
+    def load(self, log: Callable[[str], None] = print) -> Mapping[str, Any] | None:
+        """What was saved; None where nothing was. A file that cannot be read is set aside with one line."""
         try:
-            kept = json.loads(path.read_text(encoding="utf-8"))
+            kept = json.loads(self.path.read_text(encoding="utf-8"))
             if kept["sha256"] != _digest(kept["state"]):
                 raise ValueError("its checksum is another one")
             return dict(kept["state"])
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, TypeError, KeyError) as error:
-            self.set_aside(path, f"cannot be read ({error})", log)
+        except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+            self.set_aside(f"cannot be read ({error})", log)
             return None
 
-    def set_aside(self, path: Path, why: str, log: Callable[[str], None]) -> None:
+    def set_aside(self, why: str, log: Callable[[str], None]) -> None:
         """Keeps a file that cannot be used under another name."""
-        aside = path.with_name(f"{path.name}.unusable")
+        aside = self.path.with_name(f"{self.path.name}.unusable")
         try:
-            path.replace(aside)
+            self.path.replace(aside)
         except OSError as error:
-            log(f"state file {path}: {why}, and cannot be set aside ({error}); it is not used")
+            log(f"state file {self.path}: {why}, and cannot be set aside ({error}); it is not used")
         else:
-            log(f"state file {path}: {why}; set aside as {aside.name}")
+            log(f"state file {self.path}: {why}; set aside as {aside.name}")
 
     def save(self, plain: Mapping[str, Any]) -> None:
-        """Replaces the state. Raises: WorkError, it cannot be written."""
-        self._write(self.path, plain)
-
-    def send(self, sent: Mapping[str, Any]) -> None:
-        """Writes ahead what is about to be sent (`Compensator.sent`). Raises: WorkError, it cannot be written."""
-        self._write(self.ahead, sent)
-
-    def _write(self, path: Path, plain: Mapping[str, Any]) -> None:
+        """Replaces the record. Raises: WorkError, it cannot be written."""
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomic(path, json.dumps({"sha256": _digest(plain), "state": plain}))
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomic(self.path, json.dumps({"sha256": _digest(plain), "state": plain}))
         except OSError as error:
-            raise WorkError(f"state file {path}: cannot be written ({error}); give another --state") from None
+            raise WorkError(f"state file {self.path}: cannot be written ({error}); give another --state") from None
 
 
 def _digest(plain: Any) -> str:
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
+def _now_s() -> float:
+    """A monotonic clock that counts on while the computer sleeps, where the system has one, s."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
+
+
 class _Stop:
     """Signals that ask for an end: after the first one what is sent fades, the second one ends at once."""
 
     def __init__(self) -> None:
-        self.asked = False
+        self.asked, self.number = False, 0
 
     def __call__(self, number: int, frame: object) -> None:
         if self.asked:
             raise KeyboardInterrupt
-        self.asked = True
+        self.asked, self.number = True, number
 
 
 @contextmanager
@@ -115,26 +104,21 @@ class _Line:
     ) -> None:  # fmt: skip
         self.machine, self.sinks, self.state, self.log, self.seen = machine, sinks, state, log, seen
         self._failing: dict[str, str] = {}  # what has failed since it last worked, and how
-        self._saved_s = 0.0
-        self._sent: Mapping[str, Any] = {}
+        self._saved_s = -inf
+        self._saved: Mapping[str, Any] | None = None  # what was sent, as the record says
 
     def restore(self) -> None:
-        """Goes on from the state file, as far as it can be used: what was sent last in any case."""
-        if self.state is None:
+        """Goes on from the state file, as far as it can be used."""
+        known = self.state.load(self.log) if self.state is not None else None
+        if self.state is None or known is None:
             return
-        known = self.state.load(self.log)
-        if "state" in known:
-            try:
-                self.machine.restore(known["state"])
-                self.log(f"goes on from {self.state.path}")
-            except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
-                self.state.set_aside(self.state.path, f"cannot be used ({error})", self.log)
-                known.setdefault("sent", known["state"].get("axes", {}))  # it holds `Compensator.sent` among others
-        if "sent" in known:
-            try:
-                self.machine.restore_sent(known["sent"])
-            except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
-                self.state.set_aside(self.state.ahead, f"cannot be used ({error})", self.log)
+        try:
+            self.machine.restore(known)
+            self.log(f"goes on from {self.state.path}")
+        except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
+            self.state.set_aside(f"cannot be used ({error})", self.log)
+        if self.machine.stopped:
+            self.log("stopped by the operator: nothing is sent until `thermodrift compensate --start`")
 
     def answer(self, sample: Sample | None, clock_s: float, at_s: float | None = None) -> Correction:
         """The correction after a sample, or in silence; where the models fail, what was sent is held and then fades.
@@ -149,7 +133,15 @@ class _Line:
         except Exception as error:  # no sample ends the process
             self._fails("model", f"sample not used, {type(error).__name__} ({error}): {sample}"[:500])
             correction = self.machine.fault(clock_s, time_s, f"the model fails ({type(error).__name__})")
-        self._write_ahead()
+        return self._deliver(correction, clock_s)
+
+    def end(self, clock_s: float) -> Correction:
+        """The correction while the compensation ends, see `Compensator.end`."""
+        return self._deliver(self.machine.end(clock_s, time.time()), clock_s)
+
+    def _deliver(self, correction: Correction, clock_s: float) -> Correction:
+        """Hands it to the sinks; the record has what is sent before they do, so that a restart knows it."""
+        self.save(clock_s, _SAVED_EVERY_S if self.machine.sent() == self._saved else 0.0)
         for k, sink in enumerate(self.sinks):
             try:
                 sink.write(correction)
@@ -166,27 +158,19 @@ class _Line:
             self.answer(None, at_s, at_s)
             at_s += tick_s
 
-    def _write_ahead(self) -> None:
-        sent = self.machine.sent() if self.state is not None else self._sent
-        if sent != self._sent and self._kept(lambda state: state.send(sent)):
-            self._sent = sent
-
     def save(self, clock_s: float, least_s: float = 0.0) -> None:
         """Saves the state, if so much time has passed since it was."""
-        if self.state is not None and clock_s - self._saved_s >= least_s:
-            self._saved_s = clock_s
-            self._kept(lambda state: state.save(self.machine.as_plain()))
-
-    def _kept(self, write: Callable[[StateFile], None]) -> bool:
-        """Whether it could be written."""
-        assert self.state is not None
+        if self.state is None or abs(clock_s - self._saved_s) < least_s:
+            return
+        self._saved_s = clock_s
         try:
-            write(self.state)
+            self.state.save(self.machine.as_plain())
         except Exception as error:  # a full disk does not end the compensation
+            self._saved = None
             self._fails("state", str(error))
-            return False
-        self._failing.pop("state", None)
-        return True
+        else:
+            self._saved = self.machine.sent()
+            self._failing.pop("state", None)
 
     def _fails(self, what: str, why: str) -> None:
         """One line for an unbroken row of failures."""
@@ -205,7 +189,8 @@ def serve(
     seen: Callable[[Correction], None] = lambda c: None,
     fade_s: float | None = None,
     confirm: bool = False,
-) -> None:
+    start: bool = False,
+) -> int:
     """Answers samples until the source ends or a signal asks for the end; the state file keeps what was sent last.
 
     A sink that fails is reported once and tried again with the next correction: the machine holds what it has. Where
@@ -218,6 +203,10 @@ def serve(
         seen: called with every correction.
         fade_s: longest time that a stop may fade, s; None: as long as the limits need.
         confirm: the operator confirms the sensors as they are, see `Compensator.confirm`.
+        start: the operator ends a stop, see `Compensator.start`.
+
+    Returns:
+        The signal that asked for the end; 0 where the input ended.
     """
     line, stop, clock_s = _Line(machine, sinks, state, log, seen), _Stop(), 0.0
     why, failed, begun = "signal to end", None, False
@@ -226,18 +215,20 @@ def serve(
             line.restore()
             if confirm:
                 machine.confirm()
+            if start:
+                machine.start()
+            line.save(clock_s)
             try:
                 for sample in source.samples():
                     if stop.asked:
                         break
                     if not replay:
-                        clock_s = time.monotonic()
+                        clock_s = _now_s()
                     elif sample is not None:
                         if begun:
                             line.catch_up(clock_s, sample.time_s)
                         clock_s = sample.time_s
                     line.answer(sample, clock_s)
-                    line.save(clock_s, _SAVED_EVERY_S)
                     begun = begun or sample is not None
                 else:
                     why = "the input ends"
@@ -252,21 +243,19 @@ def serve(
         source.close()
         for sink in sinks:
             sink.close()
+    return stop.number
 
 
 def _fade(line: _Line, fade_s: float | None, why: str, stop: _Stop, log: Callable[[str], None]) -> None:
-    """Lets what is sent fade to 0; this is no stop by the operator, so that a restart begins with warm-up."""
+    """Lets what is sent fade to 0."""
     stop.asked = True  # the next signal ends at once
     log(why)
-    until_s = None if fade_s is None else time.monotonic() + fade_s
-    line.machine.stop()
+    until_s = inf if fade_s is None else _now_s() + fade_s
     try:
-        while until_s is None or time.monotonic() < until_s:
-            correction = line.answer(None, time.monotonic())
+        while (now_s := _now_s()) < until_s:
+            correction = line.end(now_s)
             if not any((*correction.offset_um.values(), *correction.slope_um_per_m.values())):
                 return
             time.sleep(_FADE_STEP_S)
     except KeyboardInterrupt:
         log("signal: ends with what was sent last")
-    finally:
-        line.machine.start()

@@ -63,7 +63,7 @@ def prompt() -> Iterator[None]:
 
 
 def release() -> None:
-    """Leave both signals to a library that ends by itself, within `prompt`."""
+    """Leave both signals to a part that ends by itself, within `prompt`."""
     signal.set_wakeup_fd(-1)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

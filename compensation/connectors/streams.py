@@ -242,7 +242,8 @@ class StandardInput:
 
     def __init__(self, address: str, machine: Machine, stream: BinaryIO | None = None) -> None:
         self._parser = LineParser(machine, "standard input")
-        self._stream = sys.stdin.buffer if stream is None else stream
+        stream = sys.stdin.buffer if stream is None else stream
+        self._stream = getattr(stream, "raw", stream)  # Python cannot end while a thread waits in a buffered one
         self._chunks: queue.Queue[bytes] = queue.Queue(maxsize=16)  # a full one holds the writer back
         self._closed = False
         # a thread, since no wait for a stream ends after a given time on all systems
@@ -252,7 +253,7 @@ class StandardInput:
         read1: Callable[[int], bytes] = getattr(self._stream, "read1", self._stream.read)
         while not self._closed:
             try:
-                data = read1(_CHUNK_BYTES)
+                data = read1(_CHUNK_BYTES) or b""
             except (OSError, ValueError) as error:  # ValueError: closed by somebody else
                 warn(f"standard input: cannot be read ({error}); taken as its end")
                 data = b""

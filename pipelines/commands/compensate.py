@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from data.errors import InputError
-from pipelines import console
+from pipelines import console, stopping
 from pipelines.options import Json
 
 if TYPE_CHECKING:
@@ -40,6 +40,7 @@ def compensate(
         float | None, typer.Option(help="longest time that a stop may fade, s; default: as the rate needs")
     ] = None,
     confirm: Annotated[bool, typer.Option(help="the sensors are right as they are now: a new run begins")] = False,
+    start: Annotated[bool, typer.Option(help="ends a stop by the operator, which a restart keeps")] = False,
     provisional: Provisional = False,
 ) -> None:
     """Answer the samples of a machine with corrections: limited in size and rate, safe when sensors or networks fail.
@@ -70,7 +71,11 @@ def compensate(
     )
     stated = "SIMULATED model; " if any(m.simulated for m in stored) else ""
     console.note(f"{stated}compensating {machine.machine} from {given}: {labels}, at most {rate_um_per_s:g} µm/s")
-    serve(running, source, sinks, kept, console.note, replay, fade_s=fade_s, confirm=confirm)
+    if not replay:
+        stopping.release()  # `serve` lets what is sent fade first
+    ended = serve(running, source, sinks, kept, console.note, replay, fade_s=fade_s, confirm=confirm, start=start)
+    if ended:
+        raise typer.Exit(128 + ended)
 
 
 def rehearsal_dict(r: Rehearsal) -> dict[str, Any]:

@@ -165,6 +165,66 @@ def test_readings_correct_what_the_model_misses_and_odd_ones_are_rejected() -> N
     assert any("w: reading not used: no such axis" in line for line in lines)
 
 
+@pytest.mark.parametrize("hours", [1.0, 3.0, 24.0, -1.0, -3.0, -24.0])
+@pytest.mark.parametrize("lasting", [False, True])
+def test_a_clock_that_jumps_does_not_move_the_model(hours: float, lasting: bool) -> None:
+    """One sample whose stamp is off, or a clock that is set while it runs: monotonic time decides."""
+    *train, left = make_toy_batches(8, 60)
+    given, off = samples(left), 30
+    whole = run(Compensator("toy", [model_of(train)], Substitutes.learn(train, INPUTS), left.step_s), given)
+    machine = Compensator("toy", [model_of(train)], Substitutes.learn(train, INPUTS), left.step_s)
+    done = []
+    for k, s in enumerate(given):
+        jumps = k >= off if lasting else k == off
+        stamp_s = s.time_s + 3600.0 * hours if jumps else s.time_s
+        done.append(machine.take(replace(s, time_s=stamp_s, readings_um={"z": 99.0} if k == off else {}), s.time_s))
+    where = "ahead of" if hours > 0 else "behind"
+    assert (
+        done[off].state["z"] == "hold"
+        and f"{abs(3600 * hours):.0f} s {where} the clock so far" in done[off].reasons["z"]
+    )
+    assert {c.state["z"] for c in done[off + 1 :]} == {"active"} and machine.rejected == 0
+    after = [c.offset_um["z"] for c in done[off + 1 :]]
+    assert after == pytest.approx([c.offset_um["z"] for c in whole[off + 1 :]], abs=1e-4)
+    assert abs(after[0]) > 10.0 and len(set(after)) == len(after)
+
+
+def test_a_restart_after_the_clock_was_set_goes_on() -> None:
+    *train, left = make_toy_batches(8, 60)
+    given = samples(left)
+    whole = run(Compensator("toy", [model_of(train)], None, left.step_s), given)
+    first, lines = Compensator("toy", [model_of(train)], None, left.step_s), list[str]()
+    given = [replace(s, time_s=s.time_s - 3600.0) if k >= 20 else s for k, s in enumerate(given)]
+    for k, s in enumerate(given[:40]):
+        first.take(s, 300.0 * k)
+    again = Compensator("toy", [model_of(train)], None, left.step_s, lines.append)
+    again.restore(json.loads(json.dumps(first.as_plain())))
+    after = [again.take(s, 300.0 * k) for k, s in enumerate(given[40:])]
+    assert [c.offset_um["z"] for c in after[1:]] == pytest.approx([c.offset_um["z"] for c in whole[41:]], abs=1e-4)
+    assert not lines
+
+
+def test_one_stamp_that_is_off_right_after_a_restart_begins_no_new_run() -> None:
+    *train, left = make_toy_batches(8, 60)
+    first, lines = Compensator("toy", [model_of(train)], None, left.step_s), list[str]()
+    given = samples(left)
+    run(first, given[:40])
+    again = Compensator("toy", [model_of(train)], None, left.step_s, lines.append)
+    again.restore(json.loads(json.dumps(first.as_plain())))
+    refused = again.take(replace(given[40], time_s=given[40].time_s + 86400.0), 0.0)
+    assert "ahead of the saved state" in refused.reasons["z"] and abs(refused.offset_um["z"]) > 10.0
+    assert again.take(given[41], 300.0).state["z"] == "active" and not lines
+
+
+def test_a_repeated_sample_is_silence() -> None:
+    *train, left = make_toy_batches(8, 60)
+    limits = replace(QUICK, stale_s=400.0)
+    machine, given = Compensator("toy", [model_of(train, limits=limits)], period_s=left.step_s), samples(left)
+    run(machine, given[:20])
+    states = [machine.take(given[19], given[19].time_s - 1e9 + 100.0 * k).state["z"] for k in range(1, 6)]
+    assert states == ["active"] * 4 + ["hold"]
+
+
 def test_a_restart_with_a_clock_that_was_set_back_begins_a_new_run() -> None:
     """The saved state is from the future then: without a new run the models would wait for it, as if all were well."""
     *train, left = make_toy_batches(8, 60)
@@ -173,7 +233,9 @@ def test_a_restart_with_a_clock_that_was_set_back_begins_a_new_run() -> None:
     run(first, samples(left))
     again = Compensator("toy", [model_of(train)], Substitutes.learn(train, INPUTS), left.step_s, lines.append)
     again.restore(json.loads(json.dumps(first.as_plain())))
-    earlier = run(again, samples(left, 1e9 - 7200.0))
+    early = samples(left, 1e9 - 7200.0)  # the second one agrees with the first
+    first_s = early[0].time_s - left.step_s
+    earlier = run(again, [replace(early[0], time_s=first_s), *early])[1:]
     whole = run(Compensator("toy", [model_of(train)], Substitutes.learn(train, INPUTS), left.step_s), samples(left))
     assert [c.offset_um["z"] for c in earlier[5:]] == pytest.approx([c.offset_um["z"] for c in whole[5:]], abs=1e-9)
     assert lines and lines[0].endswith("h behind the saved state: a new run begins")

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compensation.safety import STOPPED, Axis, Limits, silence, start, step, stop
+from compensation.safety import STOPPED, Axis, Limits, SampleClock, silence, step
 from data.errors import InputError
 
 LIMITS = Limits(
@@ -22,7 +22,7 @@ UNIX_S = 1.7e9
 def fed(axis: Axis, first_s: int, last_s: int, wanted_um: float = 10.0, fault: str | None = None) -> Axis:
     """A sample every second from first_s to last_s, both included."""
     for t in range(first_s, last_s + 1):
-        axis, _, _ = step(axis, LIMITS, float(t), UNIX_S + t, wanted_um, fault=fault)
+        axis, _, _ = step(axis, LIMITS, float(t), wanted_um, fault=fault)
     return axis
 
 
@@ -52,7 +52,7 @@ def test_a_fault_in_warm_up_starts_it_again() -> None:
 def test_trust_reduces_the_offset_and_says_so() -> None:
     axis, axes = active(), []
     for t in range(31, 61):
-        axis, _, reason = step(axis, LIMITS, float(t), UNIX_S + t, 10.0, trust=0.4)
+        axis, _, reason = step(axis, LIMITS, float(t), 10.0, trust=0.4)
         axes.append(axis)
     assert (axis.state, axis.sent_um, reason) == ("active", 4.0, "authority 40%")
     assert axes[0].sent_um == 9.5
@@ -100,13 +100,13 @@ def test_a_fade_out_that_ends_under_valid_input_goes_on_in_warm_up() -> None:
     [(nan, 1.0, "requests nan"), (inf, 1.0, "requests inf"), (10.0, nan, "trust")],
 )
 def test_a_model_that_gives_no_number_is_a_fault(wanted_um: float, trust: float, what: str) -> None:
-    axis, sent_um, reason = step(active(), LIMITS, 31.0, UNIX_S + 31, wanted_um, trust)
+    axis, sent_um, reason = step(active(), LIMITS, 31.0, wanted_um, trust)
     assert (axis.state, sent_um) == ("hold", 10.0)
     assert what in reason
 
 
 def test_silence_moves_on_to_the_target_then_holds_fades_out_and_is_off() -> None:
-    axis, _, _ = step(active(), LIMITS, 31.0, UNIX_S + 31, 12.0)
+    axis, _, _ = step(active(), LIMITS, 31.0, 12.0)
     states = []
     for t in range(32, 80):
         axis, _, reason = silence(axis, LIMITS, float(t))
@@ -122,62 +122,83 @@ def test_silence_moves_on_to_the_target_then_holds_fades_out_and_is_off() -> Non
 
 def test_a_pause_of_the_runtime_counts_as_silence_and_buys_no_step() -> None:
     axis = active()
-    held, sent_um, _ = step(axis, LIMITS, 38.0, UNIX_S + 38, 20.0)
+    held, sent_um, _ = step(axis, LIMITS, 38.0, 20.0)
     assert (held.state, sent_um) == ("active", 12.0), "8 s are within hold; step_um limits"
-    late, sent_um, _ = step(axis, LIMITS, 3600.0, UNIX_S + 3600, 20.0)
+    late, sent_um, _ = step(axis, LIMITS, 3600.0, 20.0)
     assert (late.state, sent_um) == ("fade-out", 8.0)
 
 
-def test_a_repeated_sample_is_silence() -> None:
-    axis = active()
-    for t in range(31, 37):
-        axis, _, _ = step(axis, LIMITS, float(t), UNIX_S + 30, 20.0)
-    assert (axis.state, axis.sent_um) == ("hold", 10.0)
+def heard(
+    clock: SampleClock, axis: Axis, clock_s: float, time_s: float, wanted_um: float = 20.0
+) -> tuple[SampleClock, Axis, str]:
+    """A sample whose time stamp is judged first."""
+    clock, fault = clock.judged(LIMITS, clock_s, time_s)
+    axis, _, reason = step(axis, LIMITS, clock_s, wanted_um, fault=fault)
+    return clock, axis, reason
+
+
+def known(clock_s: float = 30.0) -> SampleClock:
+    """The clock after a sample."""
+    clock, fault = SampleClock().judged(LIMITS, clock_s, UNIX_S + clock_s)
+    assert fault is None
+    return clock
 
 
 def test_an_older_sample_is_not_used_and_the_next_one_is() -> None:
-    axis, sent_um, reason = step(active(), LIMITS, 31.0, UNIX_S + 29, 20.0)
-    assert (axis.state, sent_um, reason) == ("hold", 10.0, "clock: the sample is 1 s older than the newest one")
-    axis, sent_um, _ = step(axis, LIMITS, 32.0, UNIX_S + 32, 20.0)
-    assert (axis.state, sent_um) == ("active", 10.5)
+    clock, axis, reason = heard(known(), active(), 31.0, UNIX_S + 29)
+    assert (axis.state, axis.sent_um, reason) == ("hold", 10.0, "clock: the sample is 1 s older than the newest one")
+    _, axis, _ = heard(clock, axis, 32.0, UNIX_S + 32)
+    assert (axis.state, axis.sent_um) == ("active", 10.5)
 
 
 @pytest.mark.parametrize("jump_s", [-3600.0, 3600.0, 1e12, -1e12])
 def test_a_clock_that_jumps_holds_until_samples_have_agreed_with_it_for_warm_up(jump_s: float) -> None:
-    axis = active()
+    clock, axis = known(), active()
     for t in range(31, 35):
-        axis, sent_um, reason = step(axis, LIMITS, float(t), UNIX_S + jump_s + t, 20.0)
-        assert (axis.state, sent_um) == ("hold", 10.0)
+        clock, axis, reason = heard(clock, axis, float(t), UNIX_S + jump_s + t)
+        assert (axis.state, axis.sent_um) == ("hold", 10.0)
         assert reason.startswith("clock: ")
-    axis, sent_um, reason = step(axis, LIMITS, 35.0, UNIX_S + jump_s + 35, 20.0)
-    assert (axis.state, sent_um, reason) == ("active", 10.5, "")
+    clock, axis, reason = heard(clock, axis, 35.0, UNIX_S + jump_s + 35)
+    assert (axis.state, axis.sent_um, reason) == ("active", 10.5, "")
+    assert UNIX_S + jump_s + 35 - clock.shift_s == pytest.approx(UNIX_S + 35, abs=1e-3)
 
 
 @pytest.mark.parametrize("time_s", [nan, inf, -inf])
 def test_a_time_stamp_that_is_no_number_is_not_used(time_s: float) -> None:
-    axis, sent_um, reason = step(active(), LIMITS, 31.0, time_s, 20.0)
-    assert (axis.state, sent_um) == ("hold", 10.0)
-    assert "clock" in reason
+    clock, axis, reason = heard(known(), active(), 31.0, time_s)
+    assert (axis.state, axis.sent_um) == ("hold", 10.0)
+    assert "clock" in reason and clock == known()
 
 
 def test_a_source_that_falls_behind_little_by_little_becomes_stale() -> None:
-    axis = active()
+    clock, axis = known(), active()
     for t in range(31, 43):
-        axis, _, reason = step(axis, LIMITS, float(t), UNIX_S + 30 + (t - 30) / 2, 10.0)
+        clock, axis, reason = heard(clock, axis, float(t), UNIX_S + 30 + (t - 30) / 2, 10.0)
     assert axis.state == "hold"
     assert "behind" in reason
 
 
-def test_a_stop_fades_out_and_stays_off_until_started() -> None:
-    axis = fed(stop(active()), 31, 31)
+@pytest.mark.parametrize(
+    ("gap_s", "fault"),
+    [(600.0, None), (-3.0, None), (86400.0, "86400 s ahead of the saved state"), (-600.0, "600 s behind the saved")],
+)
+def test_the_first_sample_after_a_restart_counts_where_the_saved_state_may_be_that_old(
+    gap_s: float, fault: str | None
+) -> None:
+    clock, got = SampleClock(UNIX_S, 7200.0).judged(LIMITS, 5.0, UNIX_S + gap_s)
+    assert (got is None) if fault is None else (fault in (got or ""))
+    clock, got = clock.judged(LIMITS, 6.0, UNIX_S + gap_s + 1)
+    assert got is None and clock.shift_s == 7200.0 + (gap_s if -5 < gap_s < 0 else 0)
+
+
+def test_a_stop_fades_out_and_stays_off_until_it_ends() -> None:
+    axis, _, _ = step(active(), LIMITS, 31.0, 10.0, stop=STOPPED)
     assert (axis.state, axis.sent_um, axis.reason) == ("fade-out", 9.5, STOPPED)
-    axis = fed(axis, 32, 60)
+    for t in range(32, 61):
+        axis, _, _ = step(axis, LIMITS, float(t), 10.0, stop=STOPPED)
     assert (axis.state, axis.sent_um, axis.reason) == ("off", 0.0, STOPPED)
-    again = Axis.from_plain(axis.as_plain())
-    assert fed(again, 0, 20).state == "off", "a restart does not end a stop"
-    axis = fed(start(axis), 61, 64)
-    assert axis.state == "warm-up"
-    assert fed(axis, 65, 65).state == "active"
+    assert fed(axis, 61, 64).state == "warm-up"
+    assert fed(axis, 61, 65).state == "active"
 
 
 def test_a_restart_continues_from_the_last_offset_through_warm_up() -> None:
@@ -267,20 +288,21 @@ def _moved_on(now_s: float, pace_s: float) -> float:
 def test_the_output_is_finite_and_limited_in_size_and_rate_whatever_arrives(
     limits: Limits, calls: list[tuple[str, float, float, float, float, str | None]]
 ) -> None:
-    axis, clock_s, time_s, last_clock_s = Axis(), 0.0, UNIX_S, None
+    axis, clock, stop = Axis(), SampleClock(), ""
+    clock_s, time_s, last_clock_s = 0.0, UNIX_S, None
     for call, pace_s, sample_pace_s, wanted_um, trust, fault in calls:
         before_um = axis.sent_um
-        if call in ("stop", "start", "restart"):
-            changed = {"stop": stop, "start": start, "restart": lambda a: Axis.from_plain(a.as_plain())}[call]
-            axis = changed(axis)
+        if call == "restart":
+            axis, last_clock_s = Axis.from_plain(axis.as_plain()), None
             assert axis.sent_um == before_um
-            last_clock_s = None if call == "restart" else last_clock_s
             continue
+        stop = {"stop": STOPPED, "start": ""}.get(call, stop)
         clock_s, time_s = _moved_on(clock_s, pace_s), _moved_on(time_s, sample_pace_s)
         if call == "step":
-            axis, sent_um, _ = step(axis, limits, clock_s, time_s, wanted_um, trust, fault)
+            clock, late = clock.judged(limits, clock_s, time_s)
+            axis, sent_um, _ = step(axis, limits, clock_s, wanted_um, trust, late if fault is None else fault, stop)
         else:
-            axis, sent_um, _ = silence(axis, limits, clock_s)
+            axis, sent_um, _ = silence(axis, limits, clock_s, stop)
         known = isfinite(clock_s) and last_clock_s is not None
         elapsed_s = min(max(clock_s - last_clock_s, 0.0), limits.stale_s) if known else 0.0
         last_clock_s = clock_s if isfinite(clock_s) else last_clock_s
@@ -298,15 +320,17 @@ def test_the_output_is_finite_and_limited_in_size_and_rate_whatever_arrives(
 def test_lasting_silence_ends_at_zero_and_then_valid_input_is_used_again_whatever_came_before(
     calls: list[tuple[str, float, float, float, float, str | None]],
 ) -> None:
-    axis, clock_s, time_s = Axis(), 0.0, UNIX_S
+    axis, clock, clock_s, time_s = Axis(), SampleClock(), 0.0, UNIX_S
     for call, pace_s, sample_pace_s, wanted_um, trust, fault in calls:
         if call in ("step", "silence"):
             clock_s, time_s = _moved_on(clock_s, pace_s), _moved_on(time_s, sample_pace_s)
-            axis, _, _ = step(axis, LIMITS, clock_s, time_s, wanted_um, trust, fault)
+            clock, late = clock.judged(LIMITS, clock_s, time_s)
+            axis, _, _ = step(axis, LIMITS, clock_s, wanted_um, trust, late if fault is None else fault)
     axis, _, _ = silence(axis, LIMITS, 0.0)
     for t in range(60):
         axis, _, _ = silence(axis, LIMITS, float(t))
     assert (axis.state, axis.sent_um) == ("off", 0.0)
     for t in range(60, 120):
-        axis, _, _ = step(axis, LIMITS, float(t), UNIX_S + t, 10.0)
+        clock, late = clock.judged(LIMITS, float(t), UNIX_S + t)
+        axis, _, _ = step(axis, LIMITS, float(t), 10.0, fault=late)
     assert (axis.state, axis.sent_um) == ("active", 10.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
@@ -61,8 +60,9 @@ class Kept:
     def write(self, correction: Correction) -> None:
         self.got.append(correction)
         if self.state is not None:
-            ahead = json.loads(self.state.ahead.read_text())["state"]
-            self.ahead.append(ahead["z"]["safety"]["sent_um"])
+            record = self.state.load()
+            assert record is not None and record["heartbeat"] <= correction.heartbeat
+            self.ahead.append(record["sent"]["z"]["safety"]["sent_um"])
 
     def close(self) -> None: ...
 
@@ -114,40 +114,62 @@ def test_what_is_sent_is_on_disk_before_it_is_sent(toy: tuple[AxisModel, list[Sa
     assert sink.ahead == sink.sent_um and sink.sent_um[-1] != 0.0
 
 
-@pytest.mark.parametrize("damage", ["{", '{"sha256": "0", "state": {}}', "[]", ""])
-def test_a_state_that_cannot_be_used_is_set_aside_and_what_was_sent_goes_on(
+@pytest.mark.parametrize("damage", ["{", '{"sha256": "0", "state": {}}', "[]", "", "[" * 100_000])
+def test_a_state_that_cannot_be_read_is_set_aside(
     toy: tuple[AxisModel, list[Sample]], tmp_path: Path, damage: str
 ) -> None:
     model, rows = toy
-    state, said = StateFile(tmp_path / "state.json"), list[str]()
-    before, after = Kept(), Kept()
-    serve(compensator(model), Given(*rows[:30]), [before], state, replay=True, log=said.append)
-    state.path.write_text(damage)
-    serve(compensator(model), Given(*rows[30:]), [after], state, replay=True, log=said.append)
-    assert (tmp_path / "state.json.unusable").read_text() == damage
-    assert sum("set aside as state.json.unusable" in line for line in said) == 1
-    assert abs(after.sent_um[0] - 0.0) > 0 and abs(after.sent_um[0] - before.sent_um[-1]) <= 1.0 + 1e-9
-
-
-def test_a_state_of_other_axes_is_set_aside_too(toy: tuple[AxisModel, list[Sample]], tmp_path: Path) -> None:
-    model, rows = toy
     state, said, sink = StateFile(tmp_path / "state.json"), list[str](), Kept()
-    safe = {"state": "active", "sent_um": 7.0, "stopped": False, "held_s": 0.0}
-    slope = {**safe, "state": "off", "sent_um": 0.0}
-    state.save({"schema": "another", "axes": {"z": {"safety": safe, "slope_safety": slope}}})
-    serve(compensator(model), Given(rows[0]), [sink], state, replay=True, log=said.append)
-    assert "cannot be used" in said[0] and abs(sink.sent_um[0] - 7.0) <= 1.0
+    state.path.write_text(damage)
+    serve(compensator(model), Given(*rows[30:]), [sink], state, replay=True, log=said.append)
+    assert (tmp_path / "state.json.unusable").read_text() == damage and len(sink.answers(rows)) == 30
+    assert sum("set aside as state.json.unusable" in line for line in said) == 1
 
 
-@pytest.mark.parametrize("axes", [{"z": {}}, {"z": None}, [], None, {"z": {"safety": {}, "slope_safety": {}}}])
+@pytest.mark.parametrize(
+    "change",
+    [{"period_s": 10.0}, {"axes": {}}, {"axes": {"z": {"model": None}}}, {"watch": []}, {"grid_s": "now"}],
+)
+def test_where_the_models_are_others_what_was_sent_goes_on(
+    toy: tuple[AxisModel, list[Sample]], tmp_path: Path, change: dict[str, object]
+) -> None:
+    model, rows = toy
+    state, said, before, after = StateFile(tmp_path / "state.json"), list[str](), Kept(), Kept()
+    serve(compensator(model), Given(*rows[:30]), [before], state, replay=True, log=said.append)
+    record = state.load()
+    assert record is not None
+    state.save({**record, **change})
+    serve(compensator(model), Given(*rows[30:]), [after], state, replay=True, log=said.append)
+    if "watch" not in change:
+        assert any("cannot be used" in line and "set aside as state.json.unusable" in line for line in said)
+    assert abs(after.sent_um[0]) > 1 and abs(after.sent_um[0] - before.sent_um[-1]) <= 1.0 + 1e-9
+    assert after.got[0].heartbeat > before.got[-1].heartbeat
+
+
+@pytest.mark.parametrize("sent", [{"z": {}}, {"z": None}, [], None, {"z": {"safety": {}, "slope_safety": {}}}])
 def test_a_state_that_lacks_what_was_sent_ends_nothing(
-    toy: tuple[AxisModel, list[Sample]], tmp_path: Path, axes: object
+    toy: tuple[AxisModel, list[Sample]], tmp_path: Path, sent: object
 ) -> None:
     model, rows = toy
     state, said, sink = StateFile(tmp_path / "state.json"), list[str](), Kept()
-    state.save({"schema": "another", "axes": axes})
+    state.save({**compensator(model).as_plain(), "sent": sent})
     serve(compensator(model), Given(*rows[:5]), [sink], state, replay=True, log=said.append)
-    assert len(sink.answers(rows)) == 5 and "cannot be used" in said[0]
+    assert len(sink.answers(rows)) == 5 and (sent == [] or "cannot be used" in said[0])
+
+
+def test_a_stop_by_the_operator_stays_until_he_starts_it(toy: tuple[AxisModel, list[Sample]], tmp_path: Path) -> None:
+    model, rows = toy
+    fast = replace(model, limits=replace(LIMITS, rate_um_per_s=1e4, step_um=1e3))
+    state, said, states = StateFile(tmp_path / "state.json"), list[str](), list[str]()
+    machine = compensator(fast)
+    for part, start in ((rows[:20], False), (rows[20:30], False), (rows[30:40], False), (rows[40:], True)):
+        sink = Kept(state)
+        stop = (machine.stop,) if part[0] is rows[0] else ()
+        serve(machine, Given(*part[:10], *stop, *part[10:]), [sink], state, said.append, replay=True, start=start)
+        states.append(sink.got[-1].state["z"])
+        machine = compensator(fast)
+    assert states == ["off", "off", "off", "active"]
+    assert sum("until `thermodrift compensate --start`" in line for line in said) == 3
 
 
 @pytest.mark.parametrize("ending", ["signal", "source ends", "source fails"])
@@ -172,9 +194,9 @@ def test_a_stop_fades_before_it_ends_and_a_restart_begins_with_warm_up(
     assert max(map(abs, sink.sent_um)) > 1.0 and sink.sent_um[-1] == 0.0 and sink.got[-1].state["z"] == "off"
     assert max(abs(b - a) for a, b in zip(sink.sent_um, sink.sent_um[1:], strict=False)) <= 0.5 + 1e-9
     assert any(why in line for line in said)
-    again = compensator(fast)
-    again.restore(state.load()["state"])
-    assert not any(one["safety"]["stopped"] for one in again.sent().values())
+    after = Kept()
+    serve(compensator(fast), Given(*rows[40:50]), [after], state, said.append, replay=True)
+    assert after.got[-1].state["z"] == "active" and "stopped by the operator" not in "".join(said)
 
 
 def test_a_second_signal_ends_at_once(
@@ -184,7 +206,7 @@ def test_a_second_signal_ends_at_once(
     slow = replace(model, limits=replace(LIMITS, rate_um_per_s=0.01, step_um=0.5, stale_s=30.0))
     monkeypatch.setattr(serving.time, "sleep", lambda s: os.kill(os.getpid(), signal.SIGINT))
     clock = iter(range(10**6))
-    monkeypatch.setattr(serving.time, "monotonic", lambda: (rows[1].time_s - rows[0].time_s) * next(clock))
+    monkeypatch.setattr(serving, "_now_s", lambda: (rows[1].time_s - rows[0].time_s) * next(clock))
     sink, said = Kept(), list[str]()
     stop = lambda: os.kill(os.getpid(), signal.SIGTERM)  # noqa: E731
     serve(compensator(slow), Given(*rows[:40], stop, *rows[40:]), [sink], None, said.append)
@@ -199,7 +221,7 @@ def test_a_full_disk_and_a_sink_that_breaks_end_nothing(toy: tuple[AxisModel, li
         def write(self, correction: Correction) -> None:
             raise OSError("no route")
 
-    (tmp_path / "state.sent").mkdir()
+    state.path.mkdir()
     serve(compensator(model), Given(*rows[:10]), [Broken(), good], state, replay=True, log=said.append)
     assert len(good.answers(rows)) == 10 and sum("no route" in line for line in said) == 1
 
@@ -235,7 +257,7 @@ def test_computer_and_broker_die_fifty_times_and_nothing_jumps_at_the_receiver(
         arrives = answer is not None and clock_s >= broker_until_s and answer.heartbeat != beat
         if answer is not None and arrives:
             beat = answer.heartbeat
-            receiver, now_um, _ = safety.step(receiver, limits, clock_s, clock_s, answer.offset_um["z"])
+            receiver, now_um, _ = safety.step(receiver, limits, clock_s, answer.offset_um["z"])
         else:
             receiver, now_um, _ = safety.silence(receiver, limits, clock_s)
         sent_um.append(now_um)

@@ -5,9 +5,13 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -124,8 +128,106 @@ def test_the_state_file_goes_on(year: Path, model: Path, tmp_path: Path) -> None
     state.write_text("{")
     done = CliRunner().invoke(app, options)
     assert done.exit_code == 0 and "set aside as state.json.unusable" in done.stderr
-    again = pd.read_csv(tmp_path / "sent.csv")[column]
-    assert len(again) > len(sent) and abs(np.diff(again)[len(sent) - 1]) <= 1.0 + 1e-9
+    again = pd.read_csv(tmp_path / "sent.csv").iloc[len(sent)]
+    assert again[column] == 0.0 and again["z_state"] == "warm-up"  # starts afresh
+
+
+class Running:
+    """`thermodrift compensate` in a process of its own, at samples of now."""
+
+    def __init__(self, model: Path, state: Path, values: dict[str, float]) -> None:
+        options = ["--state", str(state), "--period-s", "300", "--rate-um-per-s", "50", "--from", "-"]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "pipelines.cli", "compensate", str(model), *options], cwd=ROOT, text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+        )  # fmt: skip
+        self.values = values
+
+    def answer(self) -> dict[str, Any]:
+        """The correction after one more sample."""
+        assert self.process.stdin is not None
+        time_s = time.time()
+        self.process.stdin.write(json.dumps({"time_s": time_s, **self.values}) + "\n")
+        self.process.stdin.flush()
+        while (record := self.next())["time_s"] != time_s:
+            pass
+        return record
+
+    def next(self) -> dict[str, Any]:
+        assert self.process.stdout is not None
+        return dict(json.loads(self.process.stdout.readline()))
+
+    def rest(self) -> list[float]:
+        """What it still sends until it ends."""
+        return [json.loads(line)["offset_um"]["z"] for line in self.process.communicate(timeout=60)[0].splitlines()]
+
+
+@pytest.fixture
+def warm(year: Path, model: Path, tmp_path: Path) -> tuple[Path, float, dict[str, float]]:
+    """A state that was saved while a machine was warm just now, what was sent, and the values of its sensors."""
+    (batch,) = read_batches(last_recording(year), model_store.load(model).machine)
+    table = batch.table.rename(columns={"time_s": "time"}).drop(columns=["z", "x"])
+    table["time"] += time.time() - table["time"].iloc[-1]
+    table.to_csv(tmp_path / "rows.csv", index=False)
+    state = tmp_path / "state.json"
+    options = ["compensate", str(model), "--replay", "--from", str(tmp_path / "rows.csv"), "--state", str(state),
+               "--period-s", "300", "--rate-um-per-s", "50"]  # fmt: skip
+    done = CliRunner().invoke(app, options)
+    assert done.exit_code == 0, done.output
+    last = json.loads(done.stdout.splitlines()[-1])
+    assert last["state"]["z"] == "active" and abs(last["offset_um"]["z"]) > 5.0
+    return state, last["offset_um"]["z"], {c: float(table[c].iloc[-1]) for c in ("front", "bed")}
+
+
+def test_after_every_end_it_starts_again_from_what_was_sent(
+    model: Path, warm: tuple[Path, float, dict[str, float]]
+) -> None:
+    state, sent_um, values = warm
+    running = Running(model, state, values)
+    first = running.answer()
+    assert first["state"]["z"] == "warm-up" and first["offset_um"]["z"] == sent_um
+
+    running.process.send_signal(signal.SIGTERM)
+    faded = [running.next()["offset_um"]["z"] for _ in range(4)]
+    running.process.kill()  # in mid-motion
+    faded += running.rest()
+    assert abs(faded[-1]) < abs(sent_um) and faded[-1] != 0.0
+
+    again = Running(model, state, values)
+    first = again.answer()
+    assert abs(first["offset_um"]["z"] - faded[-1]) <= 1.0 + 1e-9
+    assert first["state"]["z"] in ("warm-up", "fade-out") and "valid input for" in first["reasons"]["z"]
+    assert again.rest()[-1] == 0.0  # the input ends
+
+    for end in (signal.SIGTERM, None):
+        last = Running(model, state, values)
+        first = last.answer()
+        assert first["state"]["z"] == "warm-up" and "valid input for" in first["reasons"]["z"]
+        if end is not None:
+            last.process.send_signal(end)
+        assert set(last.rest()) <= {0.0} and last.process.returncode == (0 if end is None else 128 + end)
+
+
+@pytest.mark.slow  # warm-up lasts a minute
+def test_after_an_end_it_is_active_again_within_the_warm_up(
+    model: Path, warm: tuple[Path, float, dict[str, float]]
+) -> None:
+    state, sent_um, values = warm
+    ended = Running(model, state, values)
+    ended.answer()
+    ended.process.send_signal(signal.SIGTERM)
+    assert ended.rest()[-1] == 0.0
+    again, until_s = Running(model, state, values), time.monotonic() + 75.0
+    while (record := again.answer())["state"]["z"] != "active" and time.monotonic() < until_s:
+        time.sleep(1.0)
+    assert record["state"]["z"] == "active"
+    while abs(record["offset_um"]["z"]) < 0.9 * abs(sent_um) and time.monotonic() < until_s + 30.0:
+        time.sleep(1.0)
+        record = again.answer()
+    assert record["offset_um"]["z"] == pytest.approx(sent_um, rel=0.1)
+    again.process.kill()
+    again.rest()
 
 
 def test_axes_of_other_machines_and_families_that_cannot_run_are_refused(
