@@ -152,6 +152,7 @@ class Axis:
         good_s: how long the input has been valid without a break, s; None after an input that was not.
         quiet_s: time since the last valid input, s.
         clock_s: monotonic clock of the last step, s.
+        elapsed_s: time that passed with the last step that had one, s; a clock that is no number counts as that.
     """
 
     state: State = "off"
@@ -163,6 +164,7 @@ class Axis:
     good_s: float | None = None
     quiet_s: float = 0.0
     clock_s: float | None = None
+    elapsed_s: float = 0.0
 
     @property
     def behind_um(self) -> float:
@@ -256,8 +258,9 @@ def _moved(
     stop: str = "",
 ) -> tuple[Axis, float, str]:
     """One step of the core: with a usable sample where `wanted_um` is given, else `reason` says why there is none."""
-    now_s = clock_s if isfinite(clock_s) else axis.clock_s
-    elapsed_s = 0.0 if axis.clock_s is None or now_s is None else now_s - axis.clock_s
+    before_s = clock_s if axis.clock_s is None else axis.clock_s
+    now_s = clock_s if isfinite(clock_s) else before_s + axis.elapsed_s
+    elapsed_s = now_s - before_s if isfinite(before_s) else 0.0
     asked_um = 0.0 if wanted_um is None else float(trust * wanted_um)
     inputs = (elapsed_s, asked_um, float(wanted_um is not None), float(faulty), float(bool(stop)),
               *(getattr(limits, name) for name in core.LIMITS))  # fmt: skip
@@ -277,5 +280,6 @@ def _moved(
             notes.append(f"request of {asked_um:.4g} µm limited to {target_um:.4g} µm")
         reason = "; ".join(notes)
     axis = Axis(STATES[int(number)], sent_um, reason, held_s, target_um, bool(warmed),
-                None if good_s < 0.0 else good_s, quiet_s, now_s)  # fmt: skip
+                None if good_s < 0.0 else good_s, quiet_s, now_s if isfinite(now_s) else None,
+                elapsed_s if elapsed_s > 0.0 else axis.elapsed_s)  # fmt: skip
     return axis, sent_um, reason

@@ -197,12 +197,14 @@ static int core_begun;
 
 {function}(double elapsed_s, double offset_um[], double slope_um_per_m[])
 {{
+    static double last_s; /* an elapsed time that is no number counts as the one before */
     int first_row = !core_begun;
 {_locals(w)}
     core_begun = 1;
-    if (!(elapsed_s > 0.0)) {{
-        elapsed_s = 0.0;
+    if (elapsed_s > 0.0 && elapsed_s <= 1e300) {{
+        last_s = elapsed_s;
     }}
+    elapsed_s = elapsed_s <= 0.0 ? 0.0 : last_s;
 {lines}
     for (i = 0; i < {count}; i++) {{
         usable[i] = 0.0;

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import inf
 from typing import ClassVar
 
 import numpy as np
@@ -184,7 +183,7 @@ def function_block(
     """The block of what a writer holds, with declarations and a comment of its own."""
     variables = [
         *own,
-        *(f"{n} : LREAL;" for n in ("moved_s", "usable", "faulty", "stopped")),
+        *(f"{n} : LREAL;" for n in ("moved_s", "last_s", "usable", "faulty", "stopped")),
         *(f"{n} : BOOL;" for n in ("first_row", "core_begun")),
         *(f"{n} : {_KINDS[kind]};" for n, kind in w.scalars.items()),
         *(f"{n} : {_array(shape)};" for n, shape in w.memory.items()),
@@ -193,7 +192,10 @@ def function_block(
     parts = [("VAR_INPUT", given), ("VAR_OUTPUT", sent), ("VAR", variables), ("VAR CONSTANT", constants)]
     declared = "\n".join(_section(title, lines) for title, lines in parts if lines)
     comment, body = "\n".join(f"   {line}".rstrip() for line in wrapped(heading)), "\n".join(w.lines)
-    moved = f"moved_s := SEL({within('elapsed_s', 0.0, inf)}, 0.0, elapsed_s);"
+    moved = f"""IF (elapsed_s > 0.0) AND (elapsed_s <= {real(1e300)}) THEN
+    last_s := elapsed_s;
+END_IF;
+moved_s := SEL(elapsed_s <= 0.0, last_s, 0.0); (* an elapsed time that is no number counts as the one before *)"""
     return f"""(*
 {comment}
 *)

@@ -20,7 +20,7 @@ from compensation import core
 from compensation.exports import EXPORTS
 from compensation.exports.base import AxisModel, Export
 from compensation.exports.region import trust_program
-from compensation.safety import Limits
+from compensation.safety import Axis, Limits, silence, step
 from data.batch import Channel
 from features.rises import feature
 from models.program import Builder, replay
@@ -101,7 +101,7 @@ KINDS = ("good", "good", "good", "dead", "invalid", "odd", "jump", "stopped")
 def test_the_receiver_is_the_core_whatever_arrives(seed: int, tmp_path: Path) -> None:
     export, rng = machine(), np.random.default_rng(seed)
     made, of_axis, expected = C(export, "receiver", tmp_path), blocks(export, "receiver"), Sender(export.axes)
-    heartbeat, value, before, states = 0, np.zeros(3), np.zeros(3), set()
+    heartbeat, value, before, states, last_s = 0, np.zeros(3), np.zeros(3), set(), 0.0
     for number, kind in enumerate(pieces(rng, 1500, KINDS)):
         elapsed_s = float(
             rng.choice([1.0, 0.1, 0.0, 30.0, -5.0, 1e12, nan], p=[0.6, 0.2, 0.08, 0.04, 0.04, 0.02, 0.02])
@@ -110,7 +110,8 @@ def test_the_receiver_is_the_core_whatever_arrives(seed: int, tmp_path: Path) ->
         sent = np.where(rng.random(3) < 0.3, rng.choice([nan, inf, -inf, 1e308]), value) if kind == "odd" else value
         heartbeat += int(kind != "dead")
         valid, enable = kind != "invalid", kind != "stopped"
-        credited_s = elapsed_s if elapsed_s > 0.0 else 0.0
+        last_s = elapsed_s if elapsed_s > 0.0 else last_s
+        credited_s = 0.0 if elapsed_s <= 0.0 else last_s
         wanted: list[float] = []
         for k, a in enumerate(export.axes):
             came = [sent[0], sent[1]] if k == 0 else [sent[2]]
@@ -150,6 +151,26 @@ def test_a_dead_sender_is_held_then_fades_without_a_jump() -> None:
         sent.append(block.call(elapsed_s=1.0)["offset_um"])
     assert sent[60 : 60 + 65] == [10.0] * 65 and sent[-1] == 0.0
     assert np.abs(np.diff(sent)).max() == 0.5
+
+
+@needs_gcc
+@pytest.mark.parametrize("elapsed_s", [nan, inf])
+def test_a_dead_sender_fades_also_where_the_elapsed_time_is_no_number(elapsed_s: float, tmp_path: Path) -> None:
+    export = machine()
+    made, (_, block) = C(export, "receiver", tmp_path), blocks(export, "receiver")
+    received, offset, slope, axis = np.array([0.0, 10.0]), np.zeros(2), np.zeros(2), Axis()
+    limits, got = replace(LIMITS, stale_s=5.0), []
+    for t in range(240):
+        passed_s, beat = (1.0, t) if t < 60 else (elapsed_s, 59)
+        made.call("receive", ctypes.c_double(passed_s), received, np.zeros(2), ctypes.c_long(beat), 1, offset, slope)
+        done = block.call(elapsed_s=passed_s, heartbeat=beat, valid=True, received_offset_um=10.0)
+        if 0 < t < 60:  # the heartbeat of the first call says nothing
+            axis, sent_um, _ = step(axis, limits, float(t), 10.0)
+        else:
+            axis, sent_um, _ = silence(axis, limits, float(t) if t < 60 else elapsed_s)
+        got.append((offset[1], done["offset_um"], sent_um))
+    assert got[59] == (10.0, 10.0, 10.0) and got[-1] == (0.0, 0.0, 0.0)
+    assert np.abs(np.diff(got, axis=0)).max() == 0.5 and np.ptp(got, axis=1).max() == 0.0
 
 
 def weighed() -> AxisModel:

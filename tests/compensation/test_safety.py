@@ -289,11 +289,11 @@ def test_the_output_is_finite_and_limited_in_size_and_rate_whatever_arrives(
     limits: Limits, calls: list[tuple[str, float, float, float, float, str | None]]
 ) -> None:
     axis, clock, stop = Axis(), SampleClock(), ""
-    clock_s, time_s, last_clock_s = 0.0, UNIX_S, None
+    clock_s, time_s, last_clock_s, usual_s = 0.0, UNIX_S, None, 0.0
     for call, pace_s, sample_pace_s, wanted_um, trust, fault in calls:
         before_um = axis.sent_um
         if call == "restart":
-            axis, last_clock_s = Axis.from_plain(axis.as_plain()), None
+            axis, last_clock_s, usual_s = Axis.from_plain(axis.as_plain()), None, 0.0
             assert axis.sent_um == before_um
             continue
         stop = {"stop": STOPPED, "start": ""}.get(call, stop)
@@ -303,9 +303,13 @@ def test_the_output_is_finite_and_limited_in_size_and_rate_whatever_arrives(
             axis, sent_um, _ = step(axis, limits, clock_s, wanted_um, trust, late if fault is None else fault, stop)
         else:
             axis, sent_um, _ = silence(axis, limits, clock_s, stop)
-        known = isfinite(clock_s) and last_clock_s is not None
-        elapsed_s = min(max(clock_s - last_clock_s, 0.0), limits.stale_s) if known else 0.0
-        last_clock_s = clock_s if isfinite(clock_s) else last_clock_s
+        passed_s = 0.0
+        if isfinite(clock_s):
+            passed_s = 0.0 if last_clock_s is None else max(clock_s - last_clock_s, 0.0)
+            last_clock_s, usual_s = clock_s, passed_s or usual_s
+        elif last_clock_s is not None:  # counts as the time before
+            last_clock_s, passed_s = last_clock_s + usual_s, usual_s
+        elapsed_s = min(passed_s, limits.stale_s)
         assert sent_um == axis.sent_um
         assert isfinite(sent_um)
         assert abs(sent_um) <= limits.max_offset_um
