@@ -16,7 +16,7 @@ from typing import Any
 from compensation.contracts import Correction, Sample, Sink, Source
 from compensation.runtime import Compensator
 from data.errors import InputError, WorkError
-from data.files import write_atomic
+from data.files import from_json, write_atomic
 
 _SAVED_EVERY_S = 30.0  # what a power cut may lose of what was learned while what is sent does not change
 _FADE_STEP_S = 1.0  # between two corrections while a stop fades
@@ -31,13 +31,13 @@ class StateFile:
     def load(self, log: Callable[[str], None] = print) -> Mapping[str, Any] | None:
         """What was saved; None where nothing was. A file that cannot be read is set aside with one line."""
         try:
-            kept = json.loads(self.path.read_text(encoding="utf-8"))
+            kept = from_json(self.path.read_text(encoding="utf-8"))
             if kept["sha256"] != _digest(kept["state"]):
                 raise ValueError("its checksum is another one")
             return dict(kept["state"])
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        except (OSError, ValueError, TypeError, KeyError) as error:
             self.set_aside(f"cannot be read ({error})", log)
             return None
 

@@ -54,7 +54,15 @@ def check_suffix(what: str, path: Path, allowed: Sequence[str]) -> None:
         raise InputError(f"{what} {path}: unsupported file extension {path.suffix!r}; give {known}")
 
 
+_USER = re.compile(r"://(?:[^:/@\s]*:.*|[^/?#\s]*)@")  # a password that is not encoded may hold anything
+_QUERY = re.compile(r"(://[^\s?]*\?)(\S+)")
+
+
 def masked(text: str) -> str:
-    """An address, or a text with one, without its password."""
-    text = re.sub(r"(://[^:/@]*):.*@", r"\1:***@", text)
-    return re.sub(r"(?i)([?&](?:password|passwd|secret|token|key)=)[^&\s]*", r"\1***", text)
+    """An address, or a text with some, without what may be secret: the user part, and every value of the query."""
+    return _QUERY.sub(lambda found: found[1] + _keys_of(found[2]), _USER.sub("://***@", text))
+
+
+def _keys_of(query: str) -> str:
+    keys = (re.match(r"[\w.-]+=", part) for part in query.split("&"))
+    return "&".join(f"{key[0] if key else ''}***" for key in keys)

@@ -1,14 +1,16 @@
-"""Atomic writing of single files and of groups of files."""
+"""Atomic writing of single files and of groups of files, and what a JSON file holds."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 from data.errors import InputError, WorkError
@@ -31,6 +33,18 @@ def write_atomic(path: Path, content: str | bytes) -> None:
         scratch.replace(path)
     finally:
         scratch.unlink(missing_ok=True)
+
+
+def from_json(text: str | bytes | bytearray) -> Any:
+    """What a JSON text holds.
+
+    Raises:
+        ValueError: it is no JSON (json.JSONDecodeError), too deep (the same), or no text (UnicodeDecodeError).
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise json.JSONDecodeError("it is nested too deeply", "", 0) from None
 
 
 @cache

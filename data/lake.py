@@ -42,6 +42,7 @@ from typing import Any, TypeVar
 from data import manifest as listing
 from data.batch import Batch
 from data.errors import InputError, WorkError, closest
+from data.files import from_json
 from data.lakefile import content_digest, decode, encode, measured_digest, remarks_digest, safe_name, unreadable
 from data.lakestore import LOCK_WAIT_S, Folder, Locked, Stamp, open_store
 from data.manifest import Batches, Entry, Staged, Stored, Version
@@ -335,8 +336,13 @@ class Lake:
         return self._entries_of(self._store.read_stamped(f"{folder}/{LOG}")[0], folder)
 
     def _entries_of(self, log: bytes | None, folder: str) -> list[Quarantined]:
-        at, rows = self._store.path(folder), [json.loads(line) for line in (log or b"").decode().splitlines() if line]
-        return [Quarantined(**{**row, "copy": at / row["copy"] if row["copy"] else None}) for row in rows]
+        at, rows = self._store.path(folder), (log or b"").splitlines()
+        try:
+            found = [from_json(row) for row in rows if row]
+            return [Quarantined(**{**row, "copy": at / row["copy"] if row["copy"] else None}) for row in found]
+        except (ValueError, TypeError, KeyError) as error:
+            where = f"lake {self.name}/{folder}/{LOG}"
+            raise WorkError(f"{where}: cannot be read ({error}); restore it from a backup, or move it away") from None
 
     def _manifest(self, machine: str) -> tuple[dict[str, Any], Stamp]:
         """The manifest of a machine, without any batch where there is none, and its state in the store."""

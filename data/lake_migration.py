@@ -14,6 +14,7 @@ from typing import Any
 
 from data import manifest as listing
 from data.errors import InputError, WorkError
+from data.files import from_json
 from data.lake import MANIFEST, MANIFESTS, manifest_file
 from data.lakefile import content_digest, decode, measured_digest
 from data.lakestore import Store, open_store
@@ -92,7 +93,7 @@ def _read(store: Store, file: str, key: str) -> dict[str, Any]:
     where = f"lake {store.name}/{file}"
     try:
         raw = store.read(file)
-        found: dict[str, Any] = json.loads(raw)
+        found: dict[str, Any] = from_json(raw)
         schema = found["schema"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise WorkError(f"{where}: cannot be read ({error}); restore it from a backup") from None

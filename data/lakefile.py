@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from data.batch import Batch, Channel, Finding
 from data.errors import InputError, WorkError
+from data.files import from_json
 from data.machine import RESERVED, Machine, Recording, TimeColumn
 
 SCHEMA = "thermodrift.batch/1"
@@ -108,7 +109,7 @@ def decode(body: bytes, where: str, version: int = 1) -> Batch:
     """
     try:
         table = pq.ParquetFile(pa.BufferReader(body)).read()
-        meta = json.loads((table.schema.metadata or {})[META_KEY])
+        meta = from_json((table.schema.metadata or {})[META_KEY])
         if meta["schema"] != SCHEMA:
             raise ValueError(f"schema {meta['schema']!r}")
         return _batch(table, meta, version)
@@ -277,7 +278,7 @@ def native_parquet(path: Path) -> NativeParquet | None:
     if path.suffix.lower() not in (".parquet", ".pq"):
         return None
     try:
-        note = json.loads((pq.read_schema(path).metadata or {})[META_KEY])
+        note = from_json((pq.read_schema(path).metadata or {})[META_KEY])
         if note["schema"] != SCHEMA:
             return None
         keys = ("machine", "batch_id", "channels", "simulated", "start", "labels")

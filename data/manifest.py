@@ -17,6 +17,7 @@ from fnmatch import fnmatchcase
 from typing import Any, Literal
 
 from data.errors import InputError, WorkError, closest
+from data.files import from_json
 from data.lakefile import safe_name
 
 SCHEMA = "thermodrift.lake/3"
@@ -114,7 +115,7 @@ def unpack(raw: bytes, where: str, key: str) -> dict[str, Any]:
         WorkError: not readable, of an earlier version, naming strange files, or not signed with this key.
     """
     try:
-        manifest: dict[str, Any] = json.loads(raw)
+        manifest: dict[str, Any] = from_json(raw)
         schema = manifest.get("schema")
     except (ValueError, AttributeError) as error:
         raise WorkError(f"{where}: cannot be read ({error}); restore it from a backup") from None

@@ -10,7 +10,7 @@ from zoneinfo import available_timezones
 import yaml
 from pydantic import AfterValidator, BaseModel, ValidationError
 
-from data.errors import InputError, closest
+from data.errors import InputError, closest, masked
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -212,7 +212,7 @@ def _in_words(problem: ErrorDetails, model: type[BaseModel], above: str) -> str:
         return f"unknown key {key!r}; {closest(str(loc[-1]), _allowed_keys(model, loc[:-1]))}"
     if problem["type"] == "missing":
         return f"key {key!r} is missing"
-    got = repr(problem["input"])
+    got = masked(repr(problem["input"]))
     got = got if len(got) <= _SHOWN else f"{got[: _SHOWN // 2]}…{got[-_SHOWN // 2 :]}"
     return f"key {key!r}: got {got}; {problem['msg'].removeprefix('Value error, ')}"
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime as dt
-import json
 import math
 import os
 import re
@@ -18,6 +17,7 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 from compensation.contracts import Correction, Sample
 from data.errors import InputError, WorkError, closest
+from data.files import from_json
 from data.machine import Machine
 from data.readers.cells import parse_number
 from data.readers.csv import normalise
@@ -258,8 +258,8 @@ def sample_from_json(
         ValueError: not a JSON object, or no time and no `arrival_s`; the message says what was got and expected.
     """
     try:
-        given = json.loads(text)
-    except (ValueError, RecursionError):
+        given = from_json(text)
+    except ValueError:
         given = None
     if not isinstance(given, dict):
         raise ValueError(f"got {excerpt(text)}, expected one JSON object")

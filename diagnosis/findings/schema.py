@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from data.errors import InputError
+from data.files import from_json
 from data.yaml_file import parse_part
 from diagnosis.contracts import Kind
 
@@ -186,7 +187,7 @@ def read_findings(path: Path) -> Findings:
         InputError: file missing, not JSON, another schema, a misspelt key (with the closest), a wrong value.
     """
     try:
-        raw = json.loads(path.read_text(encoding="utf-8"))
+        raw = from_json(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
             f"findings file {path}: cannot be read ({error}); give the findings.json of a diagnosis"

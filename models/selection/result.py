@@ -9,6 +9,8 @@ from typing import Any
 
 import pandas as pd
 
+from data.files import from_json
+
 CELL_KEYS = ["protocol", "selector", "family", "n_tsp"]
 SCORES = ["S_um", "max_abs_um", "bias_um", "p95_abs_um", "rmse_um", "compensation_effect", "eta", "grey_degree"]
 
@@ -81,7 +83,7 @@ class GridResult:
     @classmethod
     def load(cls, folder: Path) -> GridResult:
         """The inverse of `save`."""
-        meta: dict[str, Any] = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        meta: dict[str, Any] = from_json((folder / "result.json").read_text(encoding="utf-8"))
         tables = [f.name for f in fields(cls) if (folder / f"{f.name}.parquet").exists()]
         values = {k: v for k, v in meta.items() if k != "schema"}
         values |= {name: pd.read_parquet(folder / f"{name}.parquet") for name in tables}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from data.errors import InputError
+from data.errors import InputError, masked
 from pipelines import console, stopping
 from pipelines.options import Json
 
@@ -70,7 +70,9 @@ def compensate(
         f"{a.axis} ±{a.limits.max_offset_um:.3g} µm{f' ({a.remark})' if a.remark else ''}" for a in running.axes
     )
     stated = "SIMULATED model; " if any(m.simulated for m in stored) else ""
-    console.note(f"{stated}compensating {machine.machine} from {given}: {labels}, at most {rate_um_per_s:g} µm/s")
+    console.note(
+        f"{stated}compensating {machine.machine} from {masked(given)}: {labels}, at most {rate_um_per_s:g} µm/s"
+    )
     if not replay:
         stopping.release()  # `serve` lets what is sent fade first
     ended = serve(running, source, sinks, kept, console.note, replay, fade_s=fade_s, confirm=confirm, start=start)

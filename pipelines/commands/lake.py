@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from data.errors import InputError
+from data.errors import InputError, masked
 from pipelines import console
 from pipelines.options import Json
 
@@ -161,7 +161,9 @@ def migrate(as_json: Json = False) -> None:
         console.print_json({"machines": done.machines, "files_read": done.files, "damaged": done.damaged})
         return
     signed = ", signed" if configured.lake_key else ""
-    console.line(f"lake {configured.lake}: manifests written{signed}: {len(done.machines)}; files read: {done.files}")
+    console.line(
+        f"lake {masked(configured.lake)}: manifests written{signed}: {len(done.machines)}; files read: {done.files}"
+    )
     for line in done.damaged:
         console.note(f"damaged: {line}; ingest its source again")
 

@@ -29,6 +29,7 @@ from prefect.settings import (
 )
 from prefect.states import Cancelled, Crashed, Pending
 
+from data.errors import masked
 from pipelines.caller import Say
 from pipelines.fleet.fleet_file import Fleet, FleetMachine
 from pipelines.fleet.folders import Folders
@@ -57,7 +58,7 @@ class Deployments:
     def __init__(
         self, fleet: Fleet, schema: Mapping[str, Any], folders: Folders, say: Say, again: Iterable[str] = ()
     ) -> None:
-        self.url, self._again = str(PREFECT_API_URL.value()), set(again)
+        self.url, self._again = masked(str(PREFECT_API_URL.value())), set(again)
         self._fleet, self._schema, self._folders, self._say = fleet, schema, folders, say
         self._ids: dict[UUID, FleetMachine] = {}
         self._due: dict[str, Job] = {}

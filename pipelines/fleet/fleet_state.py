@@ -19,7 +19,7 @@ from urllib.parse import quote
 
 from filelock import FileLock, Timeout
 
-from data.files import write_atomic
+from data.files import from_json, write_atomic
 from pipelines.fleet.fleet_file import Fleet
 
 
@@ -121,7 +121,7 @@ def _update(home: Path, fleet: Fleet, changes: Mapping[str, Any]) -> None:
 def read_file(path: Path) -> dict[str, Any]:
     """A file with a JSON object; empty where there is none, or none that can be read."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = from_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}

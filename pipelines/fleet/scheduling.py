@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from data.endings import ending
+from data.files import from_json
 from pipelines.caller import Say
 from pipelines.fleet import alerts, fleet_state
 from pipelines.fleet.fleet_file import Fleet, FleetMachine
@@ -138,7 +139,7 @@ class Run:
         if self.too_long:
             return {"ok": None, "summary": f"ended after {self.job.machine.limit_h:g} h (limit_h); see {self.log}"}
         try:
-            said: dict[str, Any] = json.loads(self.result.read_text(encoding="utf-8"))
+            said: dict[str, Any] = from_json(self.result.read_text(encoding="utf-8"))
             return said
         except (OSError, ValueError):
             code = self.process.returncode

@@ -4,7 +4,6 @@ A training whose twin predicts new batches worse than before is followed by one 
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shutil
@@ -21,7 +20,7 @@ import numpy as np
 from data.account import Account
 from data.batch import Batch
 from data.errors import InputError, WorkError
-from data.files import check_folder, staged
+from data.files import check_folder, from_json, staged
 from data.ingest import IngestReport
 from data.machine import Machine, load_machine
 from diagnosis.export.machine_file import diagnosed_text, drafted_text
@@ -315,7 +314,7 @@ def _check_same_machine(path: Path, machine: str) -> None:
     if not path.exists():
         return
     try:
-        before = json.loads(path.read_text(encoding="utf-8"))
+        before = from_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         before = None
     if not isinstance(before, dict) or "machine" not in before:

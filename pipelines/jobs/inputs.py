@@ -13,6 +13,7 @@ from pathlib import Path
 
 from data.batch import Batch
 from data.errors import InputError
+from data.files import from_json
 
 INPUTS = "inputs.json"
 SCHEMA = "thermodrift.diagnosis_inputs/1"
@@ -66,7 +67,7 @@ def read_inputs(folder: Path) -> Inputs:
             f"{given}: has no {INPUTS}, which names its recordings; repeat it by `thermodrift diagnose --overwrite`"
         )
     try:
-        raw = json.loads(path.read_text(encoding="utf-8"))
+        raw = from_json(path.read_text(encoding="utf-8"))
         if raw.pop("schema") != SCHEMA:
             raise ValueError(f"the schema is not {SCHEMA}")
         return Inputs(**{**raw, "recordings": tuple(Recorded(**r) for r in raw["recordings"])})

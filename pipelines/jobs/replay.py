@@ -30,7 +30,7 @@ from data.account import Account
 from data.batch import Batch
 from data.checks import check_machine, checked
 from data.errors import InputError
-from data.files import write_atomic
+from data.files import from_json, write_atomic
 from data.ingest import id_prefix
 from data.lakefile import content_digest, encode, safe_name
 from data.machine import Machine
@@ -227,7 +227,7 @@ class Progress:
         text = json.dumps(asked, indent=1, ensure_ascii=False)
         noted, file = request.out / ARRIVALS, request.out / PROGRESS
         if noted.is_file():
-            known, wanted = json.loads(noted.read_text(encoding="utf-8")), json.loads(text)
+            known, wanted = _noted(noted), from_json(text)
             if other := [k for k in wanted if known.get(k) != wanted[k]]:
                 raise InputError(
                     f"--out {request.out}: holds a replay with other {', '.join(other).replace('_', ' ')}; give the "
@@ -235,8 +235,7 @@ class Progress:
                 )
             if not file.is_file():
                 return cls(file)
-            kept = json.loads(file.read_text(encoding="utf-8"))
-            return TypeAdapter(Progress).validate_python({**kept, "file": file})
+            return TypeAdapter(Progress).validate_python({**_noted(file), "file": file})
         if request.out.exists() and (not request.out.is_dir() or any(request.out.iterdir())):
             raise InputError(f"--out {request.out}: holds something else than a replay; give another folder")
         for folder in (request.home, request.inbox):
@@ -248,6 +247,14 @@ class Progress:
         plain = asdict(self)
         del plain["file"]
         write_atomic(self.file, json.dumps(plain, indent=1, ensure_ascii=False))
+
+
+def _noted(file: Path) -> dict[str, object]:
+    """What a replay wrote. Raises: InputError, it cannot be read."""
+    try:
+        return dict(from_json(file.read_bytes()))
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(f"{file}: cannot be read ({error}); begin the replay in another --out") from None
 
 
 class _Year:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from data.files import source_digest, whole_folder, write_atomic
+from data.files import from_json, source_digest, whole_folder, write_atomic
 from models.selection.crossing import Crossing, FamilyResult
 from models.selection.race import Job
 from pipelines.caller import Say
@@ -100,11 +100,11 @@ def _write(result: FamilyResult, held: Path) -> None:
 
 def _read(held: Path) -> FamilyResult:
     """Raises OSError or ValueError where a file is missing or not as it was written."""
-    if json.loads((held / _SUMS).read_text(encoding="utf-8")) != _sums(held):
+    if from_json((held / _SUMS).read_text(encoding="utf-8")) != _sums(held):
         raise ValueError("a file is not as it was written")
     with np.load(held / "predictions.npz", allow_pickle=False) as stored:
         predictions = {name: stored[name] for name in stored.files}
-    failures = [(a, b) for a, b in json.loads((held / "failures.json").read_text(encoding="utf-8"))]
+    failures = [(a, b) for a, b in from_json((held / "failures.json").read_text(encoding="utf-8"))]
     scores, cells = (pd.read_parquet(held / f"{name}.parquet") for name in ("scores", "cells"))
     return FamilyResult(scores, cells, predictions, failures)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
 from data.errors import InputError, closest
-from data.files import write_atomic
+from data.files import from_json, write_atomic
 
 if TYPE_CHECKING:
     from pipelines.settings import Settings
@@ -60,7 +60,7 @@ def kept(settings: Settings) -> Registry:
     """What is known without MLflow; call it before the registry is read, since it states the files of the store."""
     made_from = _made_from(settings)
     try:
-        found = json.loads((settings.home / _FILE).read_text(encoding="utf-8"))
+        found = from_json((settings.home / _FILE).read_text(encoding="utf-8"))
         if made_from is not None and (found["schema"], found["made_from"]) == (_SCHEMA, made_from):
             return Registry(made_from, found["aliases"], {k: Place(**p) for k, p in found["places"].items()})
     except (OSError, ValueError, KeyError, TypeError, AttributeError):

@@ -23,6 +23,7 @@ from compensation.substitutes import Substitutes
 from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError, one_of
+from data.files import from_json
 from data.machine import Machine, parse_machine
 from models.base import Family, family_from_plain
 from models.selection.conformal import RunBound
@@ -199,7 +200,7 @@ def save(
 
 def add_hashes(folder: Path, names: Sequence[str]) -> None:
     """Note the SHA-256 of further files of a stored model, those by which it is served, in its `model.json`."""
-    _write(folder, json.loads((folder / "model.json").read_text(encoding="utf-8")), names)
+    _write(folder, from_json((folder / "model.json").read_text(encoding="utf-8")), names)
 
 
 def _write(folder: Path, document: dict[str, Any], names: Sequence[str]) -> None:
@@ -239,13 +240,13 @@ def load(folder: Path) -> StoredModel:
     """
     inner = inner_folder(folder)
     try:
-        document = json.loads((inner / "model.json").read_text(encoding="utf-8"))
+        document = from_json((inner / "model.json").read_text(encoding="utf-8"))
         _check_document(document, folder)
         _check_hashes(document.get("sha256"), inner, folder)
         machine_yaml = (inner / "machine.yml").read_text(encoding="utf-8")
         with np.load(inner / "arrays.npz", allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, BadZipFile, EOFError, RecursionError) as error:  # also text that is none
+    except (OSError, ValueError, BadZipFile, EOFError) as error:  # also text that is none
         reason = " ".join(str(error).split())
         raise InputError(
             f"model folder {folder}: not a stored model ({reason}); expected the files {', '.join(FILES)}"

@@ -30,6 +30,7 @@ from mlflow.entities.model_registry import ModelVersion, RegisteredModel
 from mlflow.tracking import MlflowClient
 from pydantic import BaseModel, ConfigDict
 
+from data.files import from_json
 from pipelines.settings import Settings
 from pipelines.store.audit import who
 
@@ -355,7 +356,7 @@ def _interrupt(client: MlflowClient, run: Run, why: str) -> None:
 def _is_gone(run: Run) -> bool:
     """Whether the process of a run was one of this computer that has ended; of others nothing is known."""
     try:
-        process = json.loads(run.data.tags.get("process", ""))
+        process = from_json(run.data.tags.get("process", ""))
         host, pid, began = process["host"], int(process["pid"]), pd.Timestamp(process["started"])
     except (ValueError, KeyError, TypeError):
         return False

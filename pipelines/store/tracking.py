@@ -32,6 +32,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from data.batch import Batch
 from data.errors import InputError, WorkError, place_of
+from data.files import from_json
 from models.families import FAMILIES
 from models.protocols import PromotionRule
 from models.selection.outlook import outlook
@@ -119,7 +120,7 @@ def store_errors(settings: Settings) -> Iterator[None]:
     except OSError as error:
         if error.errno is None:
             raise
-        where = place_of(error, settings.artifacts_uri or settings.store_name)
+        where = place_of(error, masked(settings.artifacts_uri or settings.store_uri))
         raise WorkError(f"{where}: cannot be written or read ({error.strerror or error})") from error
 
 
@@ -259,7 +260,7 @@ def load_training(training_id: str, settings: Settings) -> Training:
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"training {training_id}: its tables in {folder} cannot be read ({error})") from None
     tags = run.data.tags
-    promotion = json.loads(tags.get("promotion", "{}"))
+    promotion = from_json(tags.get("promotion", "{}"))
     if promotion:
         with store_errors(settings):
             promotion["champion_version"] = _champion_now(client, promotion["name"])
@@ -354,7 +355,7 @@ def _child(cells: pd.DataFrame, scores: pd.DataFrame, best: pd.Series | None) ->
 
 def _training_row(run: Run) -> dict[str, Any]:
     tags = run.data.tags
-    promotion = json.loads(tags.get("promotion", "{}"))
+    promotion = from_json(tags.get("promotion", "{}"))
     version = f"{promotion['name']} version {promotion['version']}" if promotion else ""
     return {
         "training_id": run.info.run_id,

@@ -318,3 +318,28 @@ def test_describe_of_what_is_no_file(place: Place) -> None:
     ) == f"{place.folder.name}: is a directory, expected one recording file; give its files, such as " + (
         f"{place.folder}/*.csv"
     )
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000, '{"a":' * 100_000, "{", "\0"], ids=["lists", "objects", "cut", "no text"]
+)
+@pytest.mark.parametrize(
+    ("file", "command"),
+    [
+        (f"home/lake/_manifest/machine={NAME}.json", ("lake", "list")),
+        (f"home/lake/_quarantine/machine={NAME}/reasons.jsonl", ("lake", "list")),
+        ("model/model.json", ("predict", "in", "--model", "model")),
+        ("small.yml", ("ingest", "in", "--machine", "small.yml")),
+        ("mlflow.yml", ("status",)),
+    ],
+)  # fmt: skip
+def test_a_file_that_is_damaged_or_nested_without_end_is_one_line(
+    place: Place, monkeypatch: pytest.MonkeyPatch, file: str, command: tuple[str, ...], text: str
+) -> None:
+    monkeypatch.chdir(place.folder)
+    write_year(place.folder / "in", 1)
+    place.ingest(place.folder / "in")
+    (place.folder / file).parent.mkdir(parents=True, exist_ok=True)
+    (place.folder / file).write_text(text)
+    done = place.call(*command)
+    assert done.code in (1, 2) and Path(file).name in trouble(done.err)

@@ -77,7 +77,7 @@ def test_what_does_not_answer_is_one_line_without_the_password(server: Server, c
         write_settings(tmp_path, broken)
         done = call("status")
         assert done.code == 1 and words in done.err and done.err.count("\n") == 1
-        assert "thermo:***@127.0.0.1" in done.err and PASSWORD not in done.out + done.err
+        assert "://***@127.0.0.1" in done.err and PASSWORD not in done.out + done.err
 
 
 def test_one_process_at_a_time_holds_a_key(server: Server, call: Call, tmp_path: Path) -> None:
