@@ -16,17 +16,17 @@ from uuid import uuid4
 from data.errors import InputError, WorkError
 
 
-def write_atomic(path: Path, content: str | bytes) -> None:
+def write_atomic(path: Path, content: str | bytes, private: bool = False) -> None:
     """Put the content (text as UTF-8, lines as they are) at `path` in one step; on failure what stood there stays.
 
-    The folder must exist.
+    The folder must exist. `private`: only its owner reads it, where there are such rights.
 
     Raises:
         OSError: it cannot be written.
     """
     scratch = path.with_name(f".{path.name}.{uuid4().hex}.part")
     try:
-        with scratch.open("wb") as file:
+        with open(scratch, "wb", opener=lambda name, flags: os.open(name, flags, 0o600 if private else 0o666)) as file:
             file.write(content.encode("utf-8") if isinstance(content, str) else content)
             file.flush()
             os.fsync(file.fileno())

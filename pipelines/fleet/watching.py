@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import re
+import secrets
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from pipelines.settings import Settings
     from pipelines.store.model_store import StoredModel
 
-SCHEMA = "thermodrift.status/2"
+SCHEMA = "thermodrift.status/3"
 KEPT_RUNS = 20  # of each channel, the newest
 KEPT_TRAININGS = 100  # the newest
 _STATUS = "status.json"
@@ -63,7 +64,8 @@ def warm() -> dict[str, Any] | None:
     kept = _kept()
     if not kept or kept["made_from"] is None:
         return None
-    return kept if kept["made_from"] == _stats(Path(name) for name in kept["made_from"]["files"]) else None
+    before = kept["made_from"]
+    return kept if before == _stats(map(Path, before["files"]), before["salt"]) else None
 
 
 def kept_channels() -> list[dict[str, Any]]:
@@ -111,8 +113,9 @@ def refresh(settings: Settings, say: Say = lambda text: None) -> dict[str, Any]:
     }  # fmt: skip
     with suppress(OSError):  # a home that cannot be written is gathered anew each time
         write_atomic(
-            fleet_state.folder_of(settings.home) / _STATUS, json.dumps(status, ensure_ascii=False, default=str)
-        )
+            fleet_state.folder_of(settings.home) / _STATUS, json.dumps(status, ensure_ascii=False, default=str),
+            private=True,
+        )  # fmt: skip
     return status
 
 
@@ -290,14 +293,15 @@ def _made_from(settings: Settings, lake: Lake) -> dict[str, Any] | None:
     if store is None or not isinstance(root, Path):
         return None
     logs = [root / "_quarantine", *sorted(root.glob("_quarantine/*/reasons.jsonl"))]
-    return _stats([*lookups.store_files(store), root / "_manifest.json", *logs])
+    return _stats([*lookups.store_files(store), root / "_manifest.json", *logs], secrets.token_hex())
 
 
-def _stats(files: Iterable[Path]) -> dict[str, Any]:
-    """Size and time of change of files, None where one is not there; the settings file of the working directory, and
-    the variables that decide where store and lake are. MLFLOW_TRACKING_URI is none of them: MLflow itself sets it."""
+def _stats(files: Iterable[Path], salt: str) -> dict[str, Any]:
+    """Size and time of change of files, None where one is not there; and a digest of the settings file of the working
+    directory, and of the variables that decide where store and lake are, salted since some are secrets.
+    MLFLOW_TRACKING_URI is none of them: MLflow itself sets it."""
     settings = Path("mlflow.yml").resolve()
     own = settings.read_text(encoding="utf-8", errors="replace") if settings.exists() else ""
-    named = dict.fromkeys((*_VARIABLES, *_NAMED.findall(own)))
-    variables = {v: hashlib.sha256(os.environ.get(v, "").encode()).hexdigest() for v in named}  # some are secrets
-    return {"files": lookups.stats(files), "variables": variables, "settings": own}
+    named = {v: os.environ.get(v, "") for v in (*_VARIABLES, *_NAMED.findall(own))}
+    digest = hashlib.scrypt(json.dumps([own, named]).encode(), salt=salt.encode(), n=2**10, r=8, p=1).hex()
+    return {"files": lookups.stats(files), "salt": salt, "settings": digest}

@@ -35,6 +35,7 @@ SCHEMA = "thermodrift.model/3"
 _READABLE = ("thermodrift.model/2", SCHEMA)  # /2 had no bounds of a run
 _REGISTERED = re.compile(r"^models:/(?P<name>[^/@]+)(?:@(?P<alias>.+)|/(?P<version>.+))?$")
 FILES = ("model.json", "arrays.npz", "machine.yml")
+CODE = "pyfunc_model.py"  # by which MLflow loads a registered model, in the folder around the other files
 SERVED = ("serving.json", "model.onnx", "region.onnx")  # only of families that are programs
 Standing = Literal["champion", "provisional", "refused"]
 _AGAIN = "load the model from the registry again, or promote it again"
@@ -273,11 +274,13 @@ def _check_document(document: Any, folder: Path) -> None:
 
 def _check_hashes(noted: Any, inner: Path, folder: Path) -> None:
     """Refuse files other than those that were stored. Those that only serve may be absent: here nothing is served."""
-    for name in (*FILES[1:], *SERVED):
-        if name in SERVED and not (inner / name).exists():
+    for name in (*FILES[1:], *SERVED, CODE):
+        where = (folder if name == CODE else inner) / name
+        unnoted = name == CODE and isinstance(noted, dict) and CODE not in noted  # of an earlier program
+        if name not in FILES and (unnoted or not where.exists()):
             continue
         expected = str(noted.get(name, "")) if isinstance(noted, dict) else ""
-        got = hashlib.sha256((inner / name).read_bytes()).hexdigest()
+        got = hashlib.sha256(where.read_bytes()).hexdigest()
         if got != expected:
             raise InputError(
                 f"model folder {folder}: not a stored model as it was promoted ({name} has sha256 {got[:12]}…, "

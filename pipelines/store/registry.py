@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -567,6 +568,8 @@ def _log_version(client: MlflowClient, name: str, new: Newcomer, tags: dict[str,
             folder, new.family, new.machine_yaml, new.batches, new.region, info, bound, result.curves, result.stack
         )
         served = write_served(stored, folder, stored.info["step_s"])
+        code = Path(shutil.copy(Path(pyfunc_model.__file__).resolve(), folder / model_store.CODE))
+        model_store.add_hashes(folder, [code.name])
         tags |= {"sha256": model_store.digest(folder)}
         channels = stored.channels()
         drivers = [d for d in stored.machine.names("driver") if d not in channels]
@@ -580,7 +583,7 @@ def _log_version(client: MlflowClient, name: str, new: Newcomer, tags: dict[str,
         model_id = _begin_model(client, new.training_id, choice)
         logged = mlflow.pyfunc.log_model(
             model_id=model_id,
-            python_model=str(Path(pyfunc_model.__file__).resolve()),
+            python_model=str(code),
             artifacts={f: str(folder / f) for f in (*model_store.FILES, *served)},
             signature=signature,
             input_example=_example(stored, [*channels, *drivers]),

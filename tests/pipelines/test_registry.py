@@ -225,6 +225,17 @@ def test_a_registered_model_that_was_changed_is_refused_whatever_it_says_of_itse
     load_model(str(file.parent), store)  # a folder has no registry to be held against
 
 
+def test_a_changed_loader_of_a_registered_model_is_refused(store):
+    train(store, "toy-loader", [5.0, 6.0] * 3)
+    load_model("models:/toy-loader-z@champion", store)
+    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    source = client.get_model_version("toy-loader-z", "1").source
+    file = Path(registry.local_folder(source, store)) / "pyfunc_model.py"
+    file.write_text(file.read_text() + "\n")
+    with pytest.raises(InputError, match=r"not a stored model as it was promoted \(pyfunc_model\.py has sha256"):
+        load_model("models:/toy-loader-z@champion", store)
+
+
 def test_a_choice_that_is_not_to_be_trusted_says_so(store):
     batches = toy_batches("toy-zero", 6)
     result = toy_result(batches, {"none|zero|0": [5.0] * 6, "none|mlr|2": [9.0] * 6})

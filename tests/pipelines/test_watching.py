@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -147,6 +149,22 @@ def test_only_what_changed_is_gathered_again(place: Place, monkeypatch: pytest.M
     assert watching.refresh(place.settings)["lake"][NAME]["quarantined"] == 1
 
 
+def test_what_is_kept_tells_no_secret(place: Place, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("LAKE_KEY", "hunter2")
+    Path("mlflow.yml").write_text('lake: "{home}/lake"  # with {env:LAKE_KEY}, before: opensesame\n')
+    kept = place.home / "fleet" / "status.json"
+    kept.unlink(missing_ok=True)
+    watching.refresh(place.settings)
+    text = kept.read_text()
+    for secret in ("hunter2", "opensesame"):
+        assert not any(told in text for told in (secret, hashlib.sha256(secret.encode()).hexdigest()))
+    assert os.name != "posix" or kept.stat().st_mode & 0o777 == 0o600
+    assert watching.warm() is not None
+    monkeypatch.setenv("LAKE_KEY", "hunter3")
+    assert watching.warm() is None
+
+
 def test_a_model_that_cannot_be_read_is_said(place: Place) -> None:
     client = registry.open_store(place.settings)
     source = registry.find_version(client, f"{NAME}-z", "champion").source
@@ -186,7 +204,7 @@ def test_the_command_shows_it_and_fails_on_alert(
 
 
 def test_a_home_that_cannot_be_written_is_read_all_the_same(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(*_: object) -> None:
+    def refused(*_: object, **__: object) -> None:
         raise PermissionError(13, "Permission denied")
 
     (place.home / "fleet" / f"{NAME}.state.json").unlink(missing_ok=True)
