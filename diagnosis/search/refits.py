@@ -111,8 +111,8 @@ def refit(now: Fitted, s: Scored) -> Fitted | None:
 
 
 def _usual(c: Candidate, fitted: Fitted, sizes: Mapping[str, float]) -> bool:
-    """Whether it is an error that any sensor or length may have (`candidates.discretisation`), of no more than its usual
-    size: one that is larger than the others is no physics yet."""
+    """Whether it is an error that any sensor or length may have (`candidates.discretisation`), within its usual size:
+    one that is larger than those of the others is no effect yet."""
     if c.name not in sizes or c.part is None:
         return False
     most = POLICY.usual_error_sd * sizes[c.name]
