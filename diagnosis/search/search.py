@@ -124,13 +124,14 @@ def decided(done: Round) -> Round:
 
 
 def _fair(now: Fitted, settled: Sequence[Tried]) -> Fitted:
-    """The fit before at the best optimum that is known without any effect: what a refit has found on its way, and would
-    keep without its effect, is no gain of that effect."""
-    best = relearned(now) if settled else now
-    for t in settled:
-        with suppress(InputError, WorkError):  # where it has gone with the effect, no machine without it is
-            back = relearned(refitted(t.fitted, now.part))
-            best = back if back.log_evidence > best.log_evidence else best
+    """The fit before at the best optimum that is known without an effect: what the likeliest refit has found on its way,
+    and would keep without its effect, is no gain of that effect."""
+    if not settled:
+        return now
+    best, first = relearned(now), max(settled, key=lambda t: t.standing)
+    with suppress(InputError, WorkError):  # where it has gone with the effect, no machine without it is
+        back = relearned(refitted(first.fitted, now.part))
+        best = back if back.log_evidence > best.log_evidence else best
     return best
 
 
