@@ -124,8 +124,8 @@ def decided(done: Round) -> Round:
 
 
 def _fair(now: Fitted, settled: Sequence[Tried]) -> Fitted:
-    """The fit before at the best optimum that is known without an effect: what the likeliest refit has found on its way,
-    and would keep without its effect, is no gain of that effect."""
+    """The fit before at the best optimum that is known without an effect: what the likeliest refit has found on its
+    way, and would keep without its effect, is no gain of that effect."""
     if not settled:
         return now
     best, first = relearned(now), max(settled, key=lambda t: t.standing)
