@@ -18,7 +18,7 @@ import numpy as np
 
 from compensation import safety
 from compensation.contracts import Correction, Sample
-from compensation.safety import ENDS, NEW_RUN_S, STOPPED, Axis, Limits, SampleClock
+from compensation.safety import ENDS, STOPPED, Axis, Limits, SampleClock
 from compensation.substitutes import Guard, Substitutes, Watch
 from data.arrays import Array
 from data.errors import InputError
@@ -35,6 +35,7 @@ _MOST_BOUNDS = 5.0  # times what nine in ten runs stay below: no machine changes
 _INTERVALS = 20  # of samples, whose median is how often they arrive
 _LOST_SAMPLES = 5  # in a row are silence
 _LEAST_UM2 = 1e-12  # a variance of rounding alone
+_NEW_RUN_S = 4 * 3600.0  # of silence: the machine has cooled down unseen, so that the model starts again at 0
 _MOST_BEATS = 2**31  # what a counter of a control holds
 _MM_PER_M = 1000.0
 
@@ -221,15 +222,12 @@ class Compensator:
             notes,
         )
 
-    def silence(self, clock_s: float, time_s: float) -> Correction:
-        """The correction while nothing arrives; `time_s` is stamped on it."""
-        return self._silent(clock_s, time_s, self._stop)
+    def silence(self, clock_s: float, time_s: float, ends: bool = False) -> Correction:
+        """The correction while nothing arrives; `time_s` is stamped on it.
 
-    def end(self, clock_s: float, time_s: float) -> Correction:
-        """The correction while the compensation ends: every axis fades out. No stop: a restart begins with warm-up."""
-        return self._silent(clock_s, time_s, self._stop or ENDS)
-
-    def _silent(self, clock_s: float, time_s: float, stop: str) -> Correction:
+        `ends`: the compensation ends and every axis fades out. That is no stop: a restart begins with warm-up.
+        """
+        stop = self._stop or (ENDS if ends else "")
         return self._sent(time_s, lambda a, was, k: safety.silence(was, self._limits[a.axis], clock_s, stop))
 
     def fault(self, clock_s: float, time_s: float, why: str) -> Correction:
@@ -295,7 +293,7 @@ class Compensator:
             fault = f"lost: {', '.join(lost)}"  # channels that no regression replaces
         if fault is not None:
             return fault, notes
-        if since_s > NEW_RUN_S:
+        if since_s > _NEW_RUN_S:
             self.log(f"silent for {since_s / 3600:.1f} h: a new run begins")
             self.begin_run()
         if self._grid_s is None:

@@ -31,7 +31,6 @@ _NUMBER = {state: float(number) for number, state in enumerate(STATES)}
 
 STOPPED = "stopped by the operator"
 ENDS = "the compensation ends"
-NEW_RUN_S = 4 * 3600.0  # of silence: the machine has cooled down unseen, so that a model starts again at 0
 _CLOCK_DRIFT = 1e-3  # s per s that two healthy clocks may differ: a quartz stays below 1e-4
 
 
@@ -103,8 +102,8 @@ class SampleClock:
 
         A stamp is not used where it is older than the newest one or disagrees with the monotonic clock by more than
         stale_s: the clock of the samples has jumped, or the sample is old. Another clock is accepted once samples agree
-        with it for warm_up_s, and the first sample after a restart at once where the saved state may be that old, else
-        with the second.
+        with it for warm_up_s; after a restart it is accepted with the second sample, within stale_s of the saved state
+        with the first.
         """
         lead_s = time_s - clock_s
         if not isfinite(lead_s):
@@ -115,7 +114,7 @@ class SampleClock:
         since_newest_s = 0.0 if self.newest_s is None else time_s - self.newest_s
         taken = replace(seen, newest_s=time_s, lead_s=lead_s, other_s=None, other_for_s=0.0)
         if self.lead_s is None:
-            if -limits.stale_s <= since_newest_s <= NEW_RUN_S:  # a little behind goes on from the saved state
+            if abs(since_newest_s) <= limits.stale_s:  # what is behind goes on from the saved state
                 return replace(taken, shift_s=self.shift_s + min(since_newest_s, 0.0)), None
             jump_s, agree_s, whose = since_newest_s, 0.0, "saved state"
         else:
@@ -225,12 +224,10 @@ def step(
         fault: why the sample or the model cannot be used; None where it can.
         stop: why the axis fades out and stays off; empty where it does not.
     """
-    problem = fault
-    if fault is not None:
-        problem = fault or "unnamed fault"
-    elif not isfinite(wanted_um):
+    problem = None if fault is None else fault or "unnamed fault"
+    if problem is None and not isfinite(wanted_um):
         problem = f"the model requests {wanted_um} µm"
-    elif trust != trust:
+    elif problem is None and trust != trust:
         problem = "the trust in the model is not a number"
     if problem is not None:
         return _moved(axis, limits, clock_s, faulty=True, reason=problem, stop=stop)

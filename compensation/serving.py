@@ -120,27 +120,22 @@ class _Line:
         if self.machine.stopped:
             self.log("stopped by the operator: nothing is sent until `thermodrift compensate --start`")
 
-    def answer(self, sample: Sample | None, clock_s: float, at_s: float | None = None) -> Correction:
+    def answer(
+        self, sample: Sample | None, clock_s: float, at_s: float | None = None, ends: bool = False
+    ) -> Correction:
         """The correction after a sample, or in silence; where the models fail, what was sent is held and then fades.
 
-        `at_s`: Unix time of a silence, s; None: that of the computer.
+        `at_s`: Unix time of a silence, s; None: that of the computer. `ends`: see `Compensator.silence`. The record has
+        what is sent before the sinks do, so that a restart knows it.
         """
         time_s = sample.time_s if sample is not None else time.time() if at_s is None else at_s
         try:
-            correction = self.machine.take(sample, clock_s) if sample else self.machine.silence(clock_s, time_s)
+            correction = self.machine.take(sample, clock_s) if sample else self.machine.silence(clock_s, time_s, ends)
             if sample is not None:
                 self._failing.pop("model", None)
         except Exception as error:  # no sample ends the process
             self._fails("model", f"sample not used, {type(error).__name__} ({error}): {sample}"[:500])
             correction = self.machine.fault(clock_s, time_s, f"the model fails ({type(error).__name__})")
-        return self._deliver(correction, clock_s)
-
-    def end(self, clock_s: float) -> Correction:
-        """The correction while the compensation ends, see `Compensator.end`."""
-        return self._deliver(self.machine.end(clock_s, time.time()), clock_s)
-
-    def _deliver(self, correction: Correction, clock_s: float) -> Correction:
-        """Hands it to the sinks; the record has what is sent before they do, so that a restart knows it."""
         self.save(clock_s, _SAVED_EVERY_S if self.machine.sent() == self._saved else 0.0)
         for k, sink in enumerate(self.sinks):
             try:
@@ -253,7 +248,7 @@ def _fade(line: _Line, fade_s: float | None, why: str, stop: _Stop, log: Callabl
     until_s = inf if fade_s is None else _now_s() + fade_s
     try:
         while (now_s := _now_s()) < until_s:
-            correction = line.end(now_s)
+            correction = line.answer(None, now_s, ends=True)
             if not any((*correction.offset_um.values(), *correction.slope_um_per_m.values())):
                 return
             time.sleep(_FADE_STEP_S)

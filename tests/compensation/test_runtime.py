@@ -204,14 +204,15 @@ def test_a_restart_after_the_clock_was_set_goes_on() -> None:
     assert not lines
 
 
-def test_one_stamp_that_is_off_right_after_a_restart_begins_no_new_run() -> None:
+@pytest.mark.parametrize("hours", [1.0, 3.0, 24.0])
+def test_one_stamp_that_is_off_right_after_a_restart_moves_nothing(hours: float) -> None:
     *train, left = make_toy_batches(8, 60)
     first, lines = Compensator("toy", [model_of(train)], None, left.step_s), list[str]()
     given = samples(left)
     run(first, given[:40])
     again = Compensator("toy", [model_of(train)], None, left.step_s, lines.append)
     again.restore(json.loads(json.dumps(first.as_plain())))
-    refused = again.take(replace(given[40], time_s=given[40].time_s + 86400.0), 0.0)
+    refused = again.take(replace(given[40], time_s=given[40].time_s + 3600.0 * hours), 0.0)
     assert "ahead of the saved state" in refused.reasons["z"] and abs(refused.offset_um["z"]) > 10.0
     assert again.take(given[41], 300.0).state["z"] == "active" and not lines
 
