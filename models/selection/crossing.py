@@ -38,7 +38,6 @@ Effort = Literal["quick", "usual", "complete"]
 # Cells that are scored by all folds; `complete` scores all. More of them cost time in proportion and change little.
 FINALISTS: Mapping[Effort, int] = {"quick": 12, "usual": 36, "complete": 0}
 NETS = "torch"  # what families of networks need
-NETS_LATE = "networks are trained from effort usual on, or where they are named"
 
 
 @dataclass(frozen=True)
@@ -59,6 +58,7 @@ class Plan:
     effort: Effort = "usual"
     left_out: tuple[tuple[str, str], ...] = ()  # what cannot run here, and why
     finalists: int | None = None  # 0: no race; None: not yet known, see `suited`
+    late: tuple[str, ...] = ()  # families that a race tries only where the others leave much
 
     def suited(self, machine: Machine | None, channels: Sequence[Channel] = ()) -> Plan:
         """The plan with its selectors and families by name; `channels` are the error channels that it is for.
@@ -84,16 +84,15 @@ class Plan:
         suitable = [f for f in FAMILIES if has_twin or not FAMILIES[f].needs_twin]
         suitable = [f for f in suitable if has_axis or not FAMILIES[f].needs_position]
         suitable = [f for f in suitable if not FAMILIES[f].on_request]
-        nets = [f for f in suitable if self.effort == "quick" and NETS in FAMILIES[f].packages]
-        late = tuple((f"family {f}", NETS_LATE) for f in nets if not self.families)
-        suitable = [f for f in suitable if f not in nets]
         selectors, without = _runnable("selector", SELECTORS, self.selectors or tuple(SELECTORS))
         families, more = _runnable("family", FAMILIES, self.families or tuple(suitable))
+        nets = [f for f in families if self.effort == "quick" and NETS in FAMILIES[f].packages]
+        late = self.late if self.families else tuple(nets)
         named = bool(self.selectors and self.families)
         finalists = self.finalists if self.finalists is not None else 0 if named else FINALISTS[self.effort]
         protocols = self.protocols or tuple(p for p in PROTOCOLS if not (finalists and p in STUDIED))
         return replace(self, selectors=selectors, families=families, protocols=protocols, finalists=finalists,
-                       left_out=(*self.left_out, *without, *late, *more))  # fmt: skip
+                       left_out=(*self.left_out, *without, *more), late=late)  # fmt: skip
 
     def points(self, family: type[Family], n_inputs: int) -> tuple[int, ...]:
         """The numbers of points a family is tried with."""

@@ -15,20 +15,22 @@ and Talwalkar 2016): the best first, by their mean S with the cost of choosing, 
 (`models.selection.loss`), of each family no more than a part of them. The best cells of the four best families go on
 in any case, as runners-up and members of a stack, and so do the baselines. Of the families that simulate the twin one
 goes on only if it leads, since its folds take minutes. Unless the effort is "quick", the best cell of the twin stays
-until the third round: a growing error of the twin calls for a diagnosis.
+until the third round: a growing error of the twin calls for a diagnosis. With "quick" families of networks are tried
+only where all others leave much more than the noise of the error.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from scipy.special import stdtrit
 
+from features.design import Design
 from models.families import FAMILIES
 from models.protocols import Fold
 from models.selection.crossing import Cell, Crossing, FamilyResult, Inputs, cross_family
@@ -42,6 +44,8 @@ _FIRST_POINTS = ("correlation", 4)  # next to all points: least squares on all o
 # Relative difference of S on every run below which two cells are one model: nets that learned a linear map.
 _SAME = 0.02
 _FAMILIES_KEPT, _SELECTORS_KEPT = 8, 4  # after the first and the second round
+_MUCH = 5.0  # noises of the error: as long as all other families leave more, networks are tried in a quick race too
+_LATE = f"networks are tried where all others leave more than {_MUCH:g} noises of the error, or with effort usual"
 _CELLS_PER_FINALIST = 4  # cells of the third round for every finalist
 _RUNNERS_UP = 4  # families that are in every round
 _FAMILY_SHARE = 4  # a family has a quarter of the places at most: a stack needs unlike members
@@ -98,7 +102,12 @@ def rounds(crossing: Crossing) -> Rounds:
     few = {"last": [_last(crossing, folds.get("forward", ()))]}
     cells = {key: _first(own) for key, own in every.items()}
     twin = crossing.plan.effort != "quick"
-    first = yield _jobs(crossing, "families", cells, few, keep=False)
+    late = {key: own for key, own in cells.items() if key in crossing.plan.late}
+    first = yield _jobs(crossing, "families", {key: cells[key] for key in cells if key not in late}, few, keep=False)
+    untried = FamilyResult(pd.DataFrame(), pd.DataFrame(), {}, [(f"family {key}", _LATE) for key in late])
+    if late and _least_um(first) > _MUCH * _noise_um(crossing.design):
+        first += yield _jobs(crossing, "networks", late, few, keep=False)
+        untried = replace(untried, failures=[])
     left = _kept(first, "families", _FAMILIES_KEPT, table, twin, most=1)
     kept = {key for _, key, _ in left}
     more = {key: _tried(every[key], crossing) for key in every if key in kept}
@@ -117,7 +126,20 @@ def rounds(crossing: Crossing) -> Rounds:
     left = _kept(third, "runs", crossing.plan.finalists, table, False)
     rest = {p: own for p, own in folds.items() if p != led}
     last = yield _jobs(crossing, "finalists", _by_family(left), rest) if rest else []
-    return _with_stack(crossing, FamilyResult.joined([*third, *last]), pd.concat(table, ignore_index=True), led)
+    found = FamilyResult.joined([*third, *last, untried])
+    return _with_stack(crossing, found, pd.concat(table, ignore_index=True), led)
+
+
+def _least_um(results: Sequence[FamilyResult]) -> float:
+    """The least mean S of a cell, µm."""
+    scores = FamilyResult.joined(results).scores
+    return float(scores.groupby(["selector", "family", "n_tsp"])["S_um"].mean().min())
+
+
+def _noise_um(design: Design) -> float:
+    """The sd of white noise that second differences of the error show, µm: median over the runs (von Neumann 1941)."""
+    steps = [np.diff(design.y_um[design.group == b], 2) for b in np.unique(design.group)]
+    return float(np.median([np.sqrt(np.mean(d**2) / 6.0) for d in steps if len(d)] or [0.0]))
 
 
 def _with_stack(crossing: Crossing, result: FamilyResult, race: pd.DataFrame, led: str) -> Raced:

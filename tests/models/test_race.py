@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from models.selection.crossing import Plan, prepare, refit
 from models.selection.grid import run_grid
 from models.selection.loss import cost_of_choosing, paired, pooled
 from models.selection.promotion import choose
-from models.selection.race import rounds
+from models.selection.race import _noise_um, drive, rounds
 from models.selection.stack import Stack, weights_of
 
 FAMILIES = ("zero", "mean_curve", "mlr", "ridge", "pls", "huber", "distributed_lag", "stack")
@@ -124,9 +126,21 @@ def test_a_stack_with_more_weights_than_members_is_refused() -> None:
         Stack([("mlr", ["a"])], [0.5, 0.5])
 
 
-def test_networks_enter_a_quick_race_only_where_they_are_named() -> None:
+@pytest.mark.parametrize("noise_um", [0.0, 1000.0])
+def test_networks_enter_a_quick_race_only_where_others_leave_much(toy_batches, monkeypatch, noise_um):
+    monkeypatch.setattr("models.selection.race._noise_um", lambda design: noise_um)
     quick, usual = Plan(effort="quick").suited(None), Plan(effort="usual").suited(None)
-    late = {f for f in usual.families if "torch" in REGISTERED[f].packages}
-    assert late >= {"bp", "lstm", "gru", "tcn"} and set(usual.families) - set(quick.families) == late
-    assert {name for name, _ in quick.left_out} == {f"family {f}" for f in late} and not usual.left_out
-    assert Plan(families=("gru",), effort="quick").suited(None).families == ("gru",)
+    assert set(quick.late) == {f for f in usual.families if "torch" in REGISTERED[f].packages} and not usual.late
+    assert {"bp", "lstm", "gru", "tcn"} <= set(quick.late) and quick.suited(None) == quick
+    assert not Plan(families=("gru",), effort="quick").suited(None).late
+    plan = Plan(("correlation",), ("zero", "mlr", "ridge", "gru"), effort="quick", late=("gru",), finalists=4)
+    crossing = prepare(toy_batches(6), "z", plan)
+    raced = drive({"z": crossing}, lambda jobs: [job.run(crossing) for job in jobs])["z"]
+    assert ("gru" in set(raced.race["family"])) == (noise_um == 0.0)
+    assert ("family gru" in dict(raced.result.failures)) == (noise_um > 0.0)
+
+
+def test_the_noise_of_an_error_is_known_from_its_second_differences():
+    time_s, rng = np.arange(400.0), np.random.default_rng(0)
+    y_um = 30.0 * (1.0 - np.exp(-time_s / 100.0)) + rng.normal(0.0, 0.5, 400)
+    assert _noise_um(SimpleNamespace(y_um=y_um, group=np.repeat([0, 1], 200))) == pytest.approx(0.5, rel=0.1)
