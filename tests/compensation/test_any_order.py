@@ -121,8 +121,8 @@ class NextToTheControl(RuleBasedStateMachine):
         self.tolerated(off_s)
 
     def tolerated(self, off_s: float) -> None:
-        """A stamp that is ahead by less than a fault may move the model by that."""
-        self.slack_s += off_s if 0.0 < off_s <= LIMITS.stale_s else 0.0
+        """A stamp that is off by less than a fault may move the model by that."""
+        self.slack_s += abs(off_s) if abs(off_s) <= LIMITS.stale_s else 0.0
 
     @rule(by_s=JUMPS_S)
     def the_clock_is_set(self, by_s: float) -> None:
