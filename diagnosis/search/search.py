@@ -116,8 +116,10 @@ def decided(done: Round) -> Round:
     tried = [_against(before, t) for t in (*settled, *(t for t in done.tried if t not in likely))]
     if not tried:
         return done
-    first = sorted(tried[: len(settled)], key=lambda t: (not _resolves(t, strange), -t.standing))
-    tried = [*first, *sorted(tried[len(settled) :], key=lambda t: -t.standing)]
+    best, *rest = sorted(tried[: len(settled)], key=lambda t: (not _resolves(t, strange), -t.standing))
+    light = {t.candidate.name: t.fitted for t in likely}  # a fit under a covariance of its own holds 100 MB
+    rest = [replace(t, fitted=light[t.candidate.name]) for t in rest]
+    tried = [best, *rest, *sorted(tried[len(settled) :], key=lambda t: -t.standing)]
     return replace(
         done, before=before, tried=tuple(tried), figures=figures(before, tried), resolved=_resolves(tried[0], strange)
     )
