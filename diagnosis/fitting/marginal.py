@@ -215,16 +215,18 @@ class Level:
             root = np.linalg.cholesky(c[:-1, :-1] + self.prior * np.eye(len(c) - 1))
         except np.linalg.LinAlgError:  # columns of values that no machine has
             return -np.inf
-        fitted = solve_triangular(root, c[:-1, -1], lower=True)
+        if z is None:
+            fitted = solve_triangular(root, c[:-1, -1], lower=True)
+            left = float(c[-1, -1] - fitted @ fitted)
+        else:
+            aim = np.append(-z, 1.0)
+            left = float(aim @ c @ aim + self.prior * (z @ z))
         factor = self.factor if without is None else self.folds[without]
         logs = 2.0 * float(np.log(np.diag(root)).sum() + np.log(np.diag(factor[0])).sum())
         logs += float(self._volume.sum()) - (len(c) - 1) * np.log(self.prior)
         if without is not None:
             logs -= float(self._volume[without])
-        if z is None:
-            return -0.5 * (float(c[-1, -1] - fitted @ fitted) + logs)
-        aim = np.append(-z, 1.0)
-        return -0.5 * (float(aim @ c @ aim + self.prior * (z @ z)) + logs)
+        return -0.5 * (left + logs)
 
     def foretold(self, grams: Grams) -> Array:
         """Log density (B,) of every batch, predicted from all others."""

@@ -90,14 +90,14 @@ def screen(fitted: Fitted, every: Sequence[Candidate], before: Screen | None = N
     many = marginal.many(fitted.columns, marginal.white(seen.columns))
     prior = POLICY.screen_amplitude_noises / np.maximum(_largest_rms(fitted, seen), NO_TRACE)
     positive = _positive(every, seen)
-    gain, level_now = np.full(len(prior), -np.inf), fitted.level.log_evidence(fitted.grams)
+    gain, promised = np.full(len(prior), -np.inf), fitted.level.log_evidence(fitted.grams)
     amplitude, sd = np.zeros_like(prior), np.zeros_like(prior)
     for hyper in roomier(fitted.hyper):
         level = marginal.level(hyper)
         scores = level.screened(fitted.grams, many)
         more, mean = _gains(scores.left, scores.residual, prior, positive)
         more[seen.whole] = (scores.residual - 0.5 * scores.left)[seen.whole]
-        more += level.log_evidence(fitted.grams) - level_now
+        more += level.log_evidence(fitted.grams) - promised
         if hyper == fitted.hyper:
             own = scores
         better = more > gain

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -104,10 +104,10 @@ def rounds(crossing: Crossing) -> Rounds:
     twin = crossing.plan.effort != "quick"
     late = {key: own for key, own in cells.items() if key in crossing.plan.late}
     first = yield _jobs(crossing, "families", {key: cells[key] for key in cells if key not in late}, few, keep=False)
-    untried = FamilyResult(pd.DataFrame(), pd.DataFrame(), {}, [(f"family {key}", _LATE) for key in late])
+    untried = late
     if late and _least_um(first) > _MUCH * _noise_um(crossing.design):
         first += yield _jobs(crossing, "networks", late, few, keep=False)
-        untried = replace(untried, failures=[])
+        untried = {}
     left = _kept(first, "families", _FAMILIES_KEPT, table, twin, most=1)
     kept = {key for _, key, _ in left}
     more = {key: _tried(every[key], crossing) for key in every if key in kept}
@@ -126,7 +126,8 @@ def rounds(crossing: Crossing) -> Rounds:
     left = _kept(third, "runs", crossing.plan.finalists, table, False)
     rest = {p: own for p, own in folds.items() if p != led}
     last = yield _jobs(crossing, "finalists", _by_family(left), rest) if rest else []
-    found = FamilyResult.joined([*third, *last, untried])
+    found = FamilyResult.joined([*third, *last])
+    found.failures.extend((f"family {key}", _LATE) for key in untried)
     return _with_stack(crossing, found, pd.concat(table, ignore_index=True), led)
 
 
