@@ -23,8 +23,8 @@ from data.arrays import Array
 from features.design import Design
 from models.base import inner_groups
 from models.families import FAMILIES
+from models.families.trees import HistGradientBoosting, RandomForest
 from models.numerics.kernels import Rows, evenly, unit_scale
-from models.numerics.trees import training_rows
 
 PENALTIES = np.logspace(-6, 3, 25)
 
@@ -114,19 +114,19 @@ CHEAP = tuple(f for f in PLAIN if f in FAMILIES and FAMILIES[f].closed_form)
 
 
 def _boosted(design: Design, train: Sequence[int], test: int) -> Array:
-    own = FAMILIES["hist_gradient_boosting"]().options()
-    rows = training_rows("hist_gradient_boosting", design, train, own["max_rows"], 720)
+    own = HistGradientBoosting()
+    rows = own.training_rows(design, train)
     model = HistGradientBoostingRegressor(
-        max_iter=own["n_trees"], learning_rate=own["rate"], max_leaf_nodes=own["leaves"], min_samples_leaf=own["leaf"],
-        early_stopping=False, random_state=own["seed"],
+        max_iter=own.n_trees, learning_rate=own.rate, max_leaf_nodes=own.leaves, min_samples_leaf=own.leaf,
+        early_stopping=False, random_state=own.seed,
     )  # fmt: skip
     return np.asarray(model.fit(design.x[rows], design.y_um[rows]).predict(design.x[design.rows(test)]))
 
 
 def _forest(design: Design, train: Sequence[int], test: int) -> Array:
-    own = FAMILIES["random_forest"]().options()
-    rows = training_rows("random_forest", design, train, own["max_rows"], 480)
-    model = RandomForestRegressor(own["n_trees"], min_samples_leaf=own["leaf"], max_features=1 / 3, random_state=0)
+    own = RandomForest()
+    rows = own.training_rows(design, train)
+    model = RandomForestRegressor(own.n_trees, min_samples_leaf=own.leaf, max_features=1 / 3, random_state=0)
     return np.asarray(model.fit(design.x[rows], design.y_um[rows]).predict(design.x[design.rows(test)]))
 
 

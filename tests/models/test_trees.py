@@ -9,9 +9,7 @@ from sklearn.tree import DecisionTreeRegressor
 
 from features.design import Design
 from models.base import Family
-from models.families.hist_gradient_boosting import HistGradientBoosting
-from models.families.random_forest import RandomForest
-from models.numerics.trees import Trees, training_rows
+from models.families.trees import HistGradientBoosting, RandomForest, joined, walked
 
 
 def make_design(batches: int = 8, rows: int = 30, noise_um: float = 0.5, own_um: float = 0.0, seed: int = 0) -> Design:
@@ -31,14 +29,14 @@ def test_the_walk_equals_scikit_learns_trees() -> None:
     grown = [DecisionTreeRegressor(max_depth=d, random_state=d).fit(design.x, design.y_um) for d in (1, 4, 30)]
     parts = [(t.tree_.feature, t.tree_.threshold, t.tree_.children_left, t.tree_.children_right, t.tree_.value[:, 0, 0])
              for t in grown]  # fmt: skip
-    values = Trees.joined(parts).values(x32)
+    values = walked(joined(parts), x32)
     for own, tree in zip(values, grown, strict=True):
         np.testing.assert_allclose(own, tree.predict(design.x), rtol=1e-12)
 
 
 def test_a_tree_that_never_splits_is_its_value() -> None:
-    trees = Trees.joined([([-2], [-2.0], [-1], [-1], [7.5]), ([-2], [-2.0], [-1], [-1], [1.0])])
-    assert trees.values(np.zeros((3, 2))).tolist() == [[7.5] * 3, [1.0] * 3]
+    trees = joined([([-2], [-2.0], [-1], [-1], [7.5]), ([-2], [-2.0], [-1], [-1], [1.0])])
+    assert walked(trees, np.zeros((3, 2))).tolist() == [[7.5] * 3, [1.0] * 3]
 
 
 def test_boosting_equals_scikit_learns_prediction() -> None:
@@ -85,7 +83,6 @@ def test_a_missing_input_is_no_prediction_and_far_away_is_the_edge(cls: type[Fam
 
 
 def test_rows_are_thinned_evenly() -> None:
-    design = make_design()
-    assert training_rows("any", design, [1], 4).tolist() == [30, 40, 49, 59]
-    assert len(training_rows("any", design, [0, 1], 4, together=40)) == 40
+    rows = RandomForest(max_rows=4).training_rows(make_design(rows=200), range(8))
+    assert len(rows) == 480 and set(np.diff(rows[:60])) == {3, 4} and rows[59] == 199
     assert RandomForest(max_rows=10).as_published().fit_design(make_design(20), range(20)).fitted["n_rows"] == 480
