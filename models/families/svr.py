@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
-from data.arrays import Array, Mask
+from data.arrays import Array
 from data.errors import InputError
 from features.design import Design
 from models.base import inner_groups
@@ -67,14 +66,12 @@ class SVR(KernelExpansion):
             raise too_few_rows(self.key, design, train, len(rows), 2)
         scale = unit_scale(design)
         sigma, cost, epsilon, inner_rms_um = self._chosen(design, self._kept(design, train, self.max_rows // 2), scale)
-        u, y_um = design.x[rows] / scale, design.y_um[rows]
-        mean_um, spread_um = float(y_um.mean()), float(y_um.std()) or 1.0
-        target = (y_um - mean_um) / spread_um
-        support, alpha, bias = _fitted(kernel(u, u, sigma, False), target, cost, epsilon, _STEPS_FIT)
+        u = design.x[rows] / scale
+        support, alpha, bias = _fitted(kernel(u, u, sigma, False), design.y_um[rows], cost, epsilon, _STEPS_FIT)
         fitted = {
             "support": u[support],
-            "alpha": spread_um * alpha,
-            "bias": mean_um + spread_um * bias,
+            "alpha": alpha,
+            "bias": bias,
             "sigma": sigma,
             "C": cost / len(rows),
             "epsilon": epsilon,
@@ -92,42 +89,23 @@ class SVR(KernelExpansion):
         """σ, cost, ε and their left-out RMS in µm."""
         u, y_um = design.x[rows] / scale, design.y_um[rows]
         group = inner_groups(design.group[rows]) % _GROUPS
-        left = [group == g for g in np.unique(group)]
-        parts = {sigma: [_Left.of(kernel(u, u, sigma, False), y_um, g) for g in left] for sigma in self.sigmas}
+        omega = {sigma: kernel(u, u, sigma, False) for sigma in self.sigmas}
 
         def score(sigma: float, cost: float, epsilon: float) -> tuple[float, float, float, float]:
-            return float(np.mean([part.rms_um(cost, epsilon) for part in parts[sigma]])), sigma, cost, epsilon
+            rms_um = []
+            for left in (group == g for g in np.unique(group)):
+                inside = omega[sigma][:, ~left]
+                support, alpha, bias = _fitted(inside[~left], y_um[~left], cost, epsilon, _STEPS_CHOICE)
+                rms_um.append(np.sqrt(np.mean((y_um[left] - inside[left][:, support] @ alpha - bias) ** 2)))
+            return float(np.mean(rms_um)), sigma, cost, epsilon
 
         best = min(score(sigma, cost, self.epsilons[0]) for sigma in self.sigmas for cost in self.costs)
         best = min([best, *(score(best[1], best[2], epsilon) for epsilon in self.epsilons[1:])])
         return best[1], best[2], best[3], best[0]
 
 
-@dataclass(frozen=True)
-class _Left:
-    """One group of rows left out: kernel among the rows inside and of those outside with them, and their errors."""
-
-    inside: Array
-    outside: Array
-    y_um: Array
-    left_um: Array
-
-    @classmethod
-    def of(cls, omega: Array, y_um: Array, left: Mask) -> Self:
-        return cls(omega[np.ix_(~left, ~left)], omega[np.ix_(left, ~left)], y_um[~left], y_um[left])
-
-    def rms_um(self, cost: float, epsilon: float) -> float:
-        if not len(self.y_um):
-            return float(np.sqrt(np.mean(self.left_um**2)))
-        mean_um, spread_um = self.y_um.mean(), self.y_um.std() or 1.0
-        target = (self.y_um - mean_um) / spread_um
-        support, alpha, bias = _fitted(self.inside, target, cost, epsilon, _STEPS_CHOICE)
-        predicted = mean_um + spread_um * (self.outside[:, support] @ alpha + bias)
-        return float(np.sqrt(np.mean((self.left_um - predicted) ** 2)))
-
-
-def _fitted(omega: Array, y: Array, cost: float, epsilon: float, steps: int) -> tuple[Rows, Array, float]:
-    """libsvm's support rows, their weights and the bias for the kernel matrix; a scaled error y, C = cost/n.
+def _fitted(omega: Array, y_um: Array, cost: float, epsilon: float, steps: int) -> tuple[Rows, Array, float]:
+    """libsvm's support rows, their weights and the bias in µm, for the kernel matrix and C = cost/n.
 
     scikit-learn keeps this function private; its estimator takes more time to check its arguments than to solve a
     problem of this size. A test holds the result to the estimator's.
@@ -135,8 +113,9 @@ def _fitted(omega: Array, y: Array, cost: float, epsilon: float, steps: int) -> 
     from sklearn.svm import _libsvm  # here alone: a trained model predicts without it
 
     _libsvm.set_verbosity_wrap(0)  # it prints otherwise
+    mean_um, spread_um = float(y_um.mean()), float(y_um.std()) or 1.0
     support, _, _, alpha, bias, *_ = _libsvm.fit(
-        np.ascontiguousarray(omega), y, svm_type=_EPSILON_SVR, kernel="precomputed", C=cost / len(y), epsilon=epsilon,
-        max_iter=steps, cache_size=_CACHE_MB,
+        np.ascontiguousarray(omega), (y_um - mean_um) / spread_um, svm_type=_EPSILON_SVR, kernel="precomputed",
+        C=cost / len(y_um), epsilon=epsilon, max_iter=steps, cache_size=_CACHE_MB,
     )  # fmt: skip
-    return support.astype(np.int64), alpha[0], float(bias[0])
+    return support.astype(np.int64), spread_um * alpha[0], mean_um + spread_um * float(bias[0])
