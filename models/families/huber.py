@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ _MOST_STEPS = 500
 _EXACT = 1e-9  # of the target's size: a smaller scale is an exact fit
 _AT_ONCE = 1_000_000  # weights in memory
 _ROUNDING = 1e-12  # of the criterion: a larger rise is one
+_FLOOR = 1e-14  # on a diagonal of 1: fewer near rows than inputs have no unique coefficients
 
 
 class Huber(Linear):
@@ -113,8 +114,8 @@ def settle(x: Array, y: Array, member: Mask, epsilon: Array, penalty: Array, mov
     `H(z) = z²` up to |z| = ε and `2 ε |z| − ε²` beyond, r = y − x β. The criterion is convex in β and σ together.
 
     A Newton step solves for β and σ with the near and far rows as they are, and their signs: the criterion is quadratic
-    there, so that a step which changes neither is the last. Where it does not lower the criterion, it is replaced by
-    two that do: `σ² = (Σ min(r², ε² σ²) + Σ penalty β²)/n`, then weights `min(1, ε σ/|r|)`.
+    there, so that a step which changes neither is the last. A step that raises the criterion is halved: it is convex,
+    and falls along the first part.
 
     Source: P. Huber, Robust statistics (1981), sec. 7.8; P. Huber and R. Dutter, Numerical solution of robust
     regression problems, COMPSTAT (1974); the criterion: A. Owen, A robust hybrid of lasso and ridge regression (2007).
@@ -131,86 +132,53 @@ def settle(x: Array, y: Array, member: Mask, epsilon: Array, penalty: Array, mov
 def _settle(x: Array, y: Array, member: Array, epsilon: Array, penalty: Array, moves: Mask) -> Settled:
     n = np.maximum(member.sum(axis=1), 1.0)
     least = np.maximum(_EXACT * np.sqrt(member @ y**2 / n), np.finfo(float).tiny)
-    beta = _weighted(x, member, (member @ (x * y[:, None]))[:, :, None], penalty, moves)[0][:, :, 0]
+    beta = _weighted(x, member, (member @ (x * y[:, None]))[:, :, None], penalty, moves)[:, :, 0]
     scale = np.maximum(np.sqrt((member * (y - beta @ x.T) ** 2).sum(axis=1) / n), least)
     far_share, steps, lowest = np.zeros(len(n)), np.full(len(n), _MOST_STEPS), np.full(len(n), np.inf)
     held_beta, held_scale, todo = beta.copy(), scale.copy(), np.arange(len(n))
     for step in range(_MOST_STEPS):
-        at = _Place.of(x, y, member[todo], epsilon[todo], penalty[todo], beta[todo], scale[todo])
-        rose = at.criterion > (1.0 + _ROUNDING) * lowest[todo]
-        if rose.any():  # back to where it was, and on by the steps that cannot rise
-            beta[todo[rose]], scale[todo[rose]] = held_beta[todo[rose]], held_scale[todo[rose]]
-            at = _Place.of(x, y, member[todo], epsilon[todo], penalty[todo], beta[todo], scale[todo])
-        lowest[todo], held_beta[todo], held_scale[todo] = at.criterion, beta[todo], scale[todo]
-        far_share[todo] = at.far.sum(axis=1) / n[todo]
-        gram = np.empty((len(todo), x.shape[1], x.shape[1]))
-        for some, way in ((~rose, _newton), (rose, _descent)):
-            if some.any():
-                found = way(x, y, at.only(some), moves[todo[some]], least[todo[some]])
-                beta[todo[some]], scale[todo[some]], gram[some] = found
-        change = beta[todo] - held_beta[todo]
-        moved = np.sqrt(np.einsum("sj,sjk,sk->s", change, gram, change) / n[todo])
-        settled = moved + np.abs(scale[todo] - held_scale[todo]) <= _SETTLED * scale[todo]
-        steps[todo[settled]] = step + 1
-        todo = todo[~settled]
+        inside, residual = member[todo], y - beta[todo] @ x.T
+        size, reach = np.abs(residual), (epsilon * scale)[todo, None]
+        near = np.minimum(size, reach)
+        squares = np.einsum("sn,sn,sn->s", inside, near, 2.0 * size - near) + (penalty * beta**2)[todo].sum(axis=1)
+        criterion, far = (n * scale)[todo] + squares / scale[todo], inside * (size > reach)
+        fell = criterion <= (1.0 + _ROUNDING) * lowest[todo]
+        on = todo
+        if not fell.all():
+            on, back = todo[fell], todo[~fell]
+            beta[back], scale[back] = (beta[back] + held_beta[back]) / 2.0, (scale[back] + held_scale[back]) / 2.0
+            inside, residual, far, criterion = inside[fell], residual[fell], far[fell], criterion[fell]
+        lowest[on], held_beta[on], held_scale[on] = criterion, beta[on], scale[on]
+        far_share[on] = far.sum(axis=1) / n[on]
+        pull = epsilon[on, None] * ((far * np.sign(residual)) @ x)
+        beta[on], scale[on] = _newton(x, y, inside - far, pull, penalty[on], moves[on], scale[on],
+                                            n[on] - epsilon[on] ** 2 * far.sum(axis=1))  # fmt: skip
+        scale[on] = np.maximum(scale[on], least[on])
+        change = (beta[on] - held_beta[on]) @ x.T
+        moved = np.sqrt(np.einsum("sn,sn,sn->s", inside, change, change) / n[on])
+        settled = moved + np.abs(scale[on] - held_scale[on]) <= _SETTLED * scale[on]
+        steps[on[settled]] = step + 1
+        todo = np.setdiff1d(todo, on[settled])
         if not len(todo):
             break
+    beta[todo], scale[todo] = held_beta[todo], held_scale[todo]
     return Settled(beta, scale, far_share, steps)
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Where S sets stand: residuals and far rows (S, n), and the criterion (S,)."""
-
-    member: Array
-    epsilon: Array
-    penalty: Array
-    beta: Array
-    scale: Array
-    residual: Array
-    far: Array
-    criterion: Array
-
-    @classmethod
-    def of(cls, x: Array, y: Array, member: Array, epsilon: Array, penalty: Array, beta: Array, scale: Array) -> Self:
-        residual = y - beta @ x.T
-        size, reach = np.abs(residual), (epsilon * scale)[:, None]
-        near = np.minimum(size, reach)
-        squares = np.einsum("sn,sn,sn->s", member, near, 2.0 * size - near) + (penalty * beta**2).sum(axis=1)
-        criterion = member.sum(axis=1) * scale + squares / scale
-        return cls(member, epsilon, penalty, beta, scale, residual, member * (size > reach), criterion)
-
-    def only(self, some: Mask) -> Self:
-        return self if some.all() else type(self)(*(getattr(self, f.name)[some] for f in fields(self)))
-
-
-def _newton(x: Array, y: Array, at: _Place, moves: Mask, least: Array) -> tuple[Array, Array, Array]:
-    """β, σ and the matrices of β's equations, with near and far rows and their signs as they are: β = β₀ + σ β₁."""
-    near = at.member - at.far
-    pull = at.epsilon[:, None] * ((at.far * np.sign(at.residual)) @ x)
-    both, gram = _weighted(x, near, np.stack([near @ (x * y[:, None]), pull], axis=2), at.penalty, moves)
+def _newton(
+    x: Array, y: Array, near: Array, pull: Array, penalty: Array, moves: Mask, scale: Array, n_free: Array
+) -> tuple[Array, Array]:
+    """β and σ with near and far rows and their signs as they are: β = β₀ + σ β₁; twice σ where all of them fall."""
+    both = _weighted(x, near, np.stack([near @ (x * y[:, None]), pull], axis=2), penalty, moves)
     free, pulled = both[:, :, 0], both[:, :, 1]
-    squares = np.einsum("sn,sn->s", near, (y - free @ x.T) ** 2) + (at.penalty * free**2).sum(axis=1)
-    n_free = at.member.sum(axis=1) - at.epsilon**2 * at.far.sum(axis=1) - (pull * pulled).sum(axis=1)
-    scale = np.sqrt(np.divide(squares, n_free, out=at.scale**2, where=n_free > 0))
-    scale = np.maximum(scale, least)
-    return free + scale[:, None] * pulled, scale, gram
+    squares = np.einsum("sn,sn->s", near, (y - free @ x.T) ** 2) + (penalty * free**2).sum(axis=1)
+    n_free = n_free - (pull * pulled).sum(axis=1)
+    scale = np.sqrt(np.divide(squares, n_free, out=4.0 * scale**2, where=n_free > 0))
+    return free + scale[:, None] * pulled, scale
 
 
-def _descent(x: Array, y: Array, at: _Place, moves: Mask, least: Array) -> tuple[Array, Array, Array]:
-    """The same by one step of the scale, and one of least squares with weights."""
-    size = np.abs(at.residual)
-    near = np.minimum(size, (at.epsilon * at.scale)[:, None])
-    squares = np.einsum("sn,sn,sn->s", at.member, near, near) + (at.penalty * at.beta**2).sum(axis=1)
-    scale = np.maximum(np.sqrt(squares / np.maximum(at.member.sum(axis=1), 1.0)), least)
-    reach = (at.epsilon * scale)[:, None]
-    weight = at.member * np.divide(reach, size, out=np.ones_like(size), where=size > reach)
-    found, gram = _weighted(x, weight, (weight @ (x * y[:, None]))[:, :, None], at.penalty, moves)
-    return found[:, :, 0], scale, gram
-
-
-def _weighted(x: Array, weight: Array, right: Array, penalty: Array, moves: Mask) -> tuple[Array, Array]:
-    """Solutions (S, q, r) of weighted normal equations, weights (S, n), right (S, q, r); and their matrices."""
+def _weighted(x: Array, weight: Array, right: Array, penalty: Array, moves: Mask) -> Array:
+    """Solutions (S, q, r) of weighted normal equations, weights (S, n), right (S, q, r)."""
     q = x.shape[1]
     gram = np.empty((len(weight), q, q))
     for j in range(q):  # one thin product after the other: rows times q² would not fit for many inputs
@@ -220,4 +188,5 @@ def _weighted(x: Array, weight: Array, right: Array, penalty: Array, moves: Mask
     np.einsum("sjj->sj", gram)[:] += np.where(moves, penalty, 1.0)
     size = 1.0 / np.sqrt(np.einsum("sjj->sj", gram))
     even = gram * (size[:, :, None] * size[:, None, :])
-    return np.linalg.solve(even, right * (moves * size)[:, :, None]) * size[:, :, None], gram
+    np.einsum("sjj->sj", even)[:] += _FLOOR
+    return np.asarray(np.linalg.solve(even, right * (moves * size)[:, :, None]) * size[:, :, None])

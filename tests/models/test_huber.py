@@ -66,6 +66,20 @@ def test_the_criterion_has_its_minimum_there_ridge_included():
     np.testing.assert_allclose(np.append(found.beta[0], np.log(found.scale[0])), best.x, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_few_rows_with_errors_of_any_size_end_at_the_minimum(seed):
+    rng = np.random.default_rng(seed)
+    x, y = rng.normal(size=(20, 3)), rng.standard_cauchy(20)
+    epsilon, none, all_move = np.array([1.001]), np.zeros((1, 3)), np.ones((1, 3), bool)
+    found = settle(x, y, np.ones((1, 20), bool), epsilon, none, all_move)
+    size = np.full(4, 0.1 * found.scale[0])
+    at = np.append(found.beta[0], found.scale[0])
+    here = criterion(x, y, at[:3], at[3], 1.001)
+    assert found.steps[0] < 500
+    for change in (*np.diag(size), *-np.diag(size)):  # convex: no neighbour along an axis is lower at a minimum
+        assert criterion(x, y, (at + change)[:3], (at + change)[3], 1.001) >= here * (1 - 1e-8)
+
+
 def test_nothing_far_off_is_ridge_least_squares():
     design = make_design(2)
     model = Huber((100.0,), 1e-12).as_published().fit_design(design, range(K))
