@@ -33,11 +33,13 @@ class PCR(Linear):
         self.contribution = contribution
 
     def _solve(self, task: Task) -> tuple[Array, dict[str, NDArray[Any]]]:
-        if self.zero_start:
-            return _about_start(task, self.contribution)
-        values, path = principal_path(task.pool)
-        needed = count_needed(values, self.contribution)
-        return pick(task, values, path, needed, self.contribution)
+        covariance = task.pool.xx
+        if self.zero_start:  # about the start the first component would be the mean rise, and nearly all
+            total = task.masks @ task.design.moments.sum_x / task.pool.scale
+            n = np.maximum(task.pool.count, 1.0)
+            covariance = covariance - total[:, :, None] * (total / n[:, None])[:, None, :]
+        values, vectors = components(covariance)
+        return on_components(task, values, vectors, count_needed(values, self.contribution))
 
 
 class PCRByLeaveBatchOut(Tuned):
@@ -52,52 +54,23 @@ class PCRByLeaveBatchOut(Tuned):
     rank = 13
 
     def _path(self, pool: Pool) -> Array:
-        return principal_path(pool)[1]
+        values, vectors = components(pool.xx)
+        scores = np.einsum("sji,sj->si", vectors, pool.xy)
+        resolved = (values > _RESOLVED * values[:, :1]) & (values > 0)
+        weights = np.where(resolved, scores / np.where(resolved, values, 1.0), 0.0)
+        return np.asarray(np.cumsum(vectors * weights[:, None, :], axis=2) / pool.scale[:, :, None])
 
     def _refit(self, task: Task, chosen: NDArray[np.int64]) -> tuple[Array, dict[str, NDArray[Any]]]:
-        values, path = principal_path(task.pool)
-        return pick(task, values, path, chosen + 1, None)
+        return on_components(task, *components(task.pool.xx), chosen + 1)
 
     def _setting(self, pool: Pool, chosen: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
         return {"n_components": chosen + 1}
 
 
-def principal_path(pool: Pool) -> tuple[Array, Array]:
-    """Variances (S, p), largest first, and coefficients (S, p, c) per unit of the inputs with 1 … p components."""
-    values, vectors = np.linalg.eigh(pool.xx)
-    values, vectors = np.maximum(values[:, ::-1], 0.0), vectors[:, :, ::-1]
-    resolved = (values > _RESOLVED * values[:, :1]) & (values > 0)
-    scores = np.einsum("sji,sj->si", vectors, pool.xy)
-    weights = np.where(resolved, scores / np.where(resolved, values, 1.0), 0.0)
-    return values, np.cumsum(vectors * weights[:, None, :], axis=2) / pool.scale[:, :, None]
-
-
-def _about_start(task: Task, contribution: float) -> tuple[Array, dict[str, NDArray[Any]]]:
-    """Coefficients (S, p) on the components of the covariance, fitted to the error without an intercept.
-
-    The covariance is about the mean: about the start, the first component would be the mean rise and nearly all.
-    """
-    pool = task.pool
-    total = task.masks @ task.design.moments.sum_x / pool.scale
-    covariance = pool.xx - total[:, :, None] * total[:, None, :] / np.maximum(pool.count, 1.0)[:, None, None]
+def components(covariance: Array) -> tuple[Array, Array]:
+    """Variances (S, p), largest first, and directions (S, p, p), one a column, of covariances (S, p, p)."""
     values, vectors = np.linalg.eigh(covariance)
-    values, vectors = np.maximum(values[:, ::-1], 0.0), vectors[:, :, ::-1]
-    wanted = count_needed(values, contribution)
-    held = np.maximum((values > _RESOLVED * values[:, :1]).sum(axis=1), 1)
-    n_components = np.minimum(wanted, held)
-    coef = np.zeros(pool.xy.shape)
-    for f, c in enumerate(n_components):
-        onto = vectors[f, :, :c]
-        moments, right = onto.T @ pool.xx[f] @ onto, onto.T @ pool.xy[f]
-        if values[f, c - 1] * DIGITS_LEFT < values[f, 0]:
-            x, y_um = task.centred_rows(int(f))
-            coef[f] = onto @ np.linalg.lstsq(x @ onto, y_um, rcond=None)[0]
-        else:
-            coef[f] = onto @ np.linalg.lstsq(moments, right, rcond=None)[0]
-    cumulated = np.cumsum(values, axis=1)
-    reached = np.take_along_axis(cumulated, n_components[:, None] - 1, axis=1)[:, 0]
-    reached = reached / np.where(cumulated[:, -1] > 0, cumulated[:, -1], 1.0)
-    return coef / pool.scale, {"n_components": n_components, "contribution": reached}
+    return np.maximum(values[:, ::-1], 0.0), vectors[:, :, ::-1]
 
 
 def count_needed(values: Array, contribution: float) -> NDArray[np.int64]:
@@ -107,22 +80,27 @@ def count_needed(values: Array, contribution: float) -> NDArray[np.int64]:
     return np.minimum(short, values.shape[1]) if contribution < 1 else np.full(len(values), values.shape[1])
 
 
-def pick(
-    task: Task, values: Array, path: Array, n_components: NDArray[np.int64], contribution: float | None
+def on_components(
+    task: Task, values: Array, vectors: Array, wanted: NDArray[np.int64]
 ) -> tuple[Array, dict[str, NDArray[Any]]]:
-    """Coefficients (S, p) with so many components; from the rows where the last is too small for the covariance."""
-    last = n_components - 1
-    coef = np.take_along_axis(path, last[:, None, None], axis=2)[:, :, 0]
-    total = np.cumsum(values, axis=1)
-    reached = np.take_along_axis(total, last[:, None], axis=1)[:, 0] / np.where(total[:, -1] > 0, total[:, -1], 1.0)
-    smallest = np.take_along_axis(values, last[:, None], axis=1)[:, 0]
-    n_components = n_components.copy()
-    for f in np.flatnonzero((values[:, 0] > 0) & (smallest * DIGITS_LEFT < values[:, 0])):
+    """Least squares (S, p) per unit of the inputs on so many leading components, as far as these are resolved.
+
+    From the rows where the last component is too small for the sums.
+    """
+    pool = task.pool
+    held = np.maximum((values > _RESOLVED * values[:, :1]).sum(axis=1), 1)
+    n_components = np.minimum(wanted, held)
+    onto = vectors * (np.arange(values.shape[1]) < n_components[:, None])[:, None, :]
+    back = np.swapaxes(onto, 1, 2)
+    moments = back @ pool.xx @ onto
+    diagonal = np.einsum("sjj->sj", moments)
+    diagonal += diagonal == 0
+    coef = (onto @ np.linalg.solve(moments, back @ pool.xy[:, :, None]))[:, :, 0]
+    last = n_components[:, None] - 1
+    smallest = np.take_along_axis(values, last, axis=1)[:, 0]
+    for f in np.flatnonzero(smallest * DIGITS_LEFT < values[:, 0]):
         x, y_um = task.centred_rows(int(f))
-        u, singular, vt = np.linalg.svd(x, full_matrices=False)
-        held = int((singular > EPS * max(float(task.pool.count[f]), x.shape[1]) * singular[0]).sum())
-        wanted = n_components[f] if contribution is None else count_needed(singular[None] ** 2, contribution)[0]
-        c = n_components[f] = min(int(wanted), held)
-        coef[f] = ((u[:, :c].T @ y_um) / singular[:c]) @ vt[:c] / task.pool.scale[f]
-        reached[f] = (singular[:c] ** 2).sum() / (singular**2).sum()
-    return coef, {"n_components": n_components, "contribution": reached}
+        coef[f] = onto[f] @ np.linalg.lstsq(x @ onto[f], y_um, rcond=None)[0]
+    total = np.cumsum(values, axis=1)
+    reached = np.take_along_axis(total, last, axis=1)[:, 0] / np.where(total[:, -1] > 0, total[:, -1], 1.0)
+    return coef / pool.scale, {"n_components": n_components, "contribution": reached}
