@@ -42,11 +42,11 @@ _WAITING_VALUES = 10_000_000  # of the inputs of stacks that wait to be joined
 
 @dataclass(frozen=True)
 class _Lesson:
-    """A stack, where its nets belong (subset, fold), and what is known of each before it is trained."""
+    """A net's rows, where it belongs (subset, fold), and what is known of it before it is trained."""
 
     stack: Stack
-    places: list[tuple[int, int]]
-    known: list[Plain]
+    place: tuple[int, int]
+    known: Plain
 
 
 class SequenceNet(Family):
@@ -218,11 +218,9 @@ class SequenceNet(Family):
             coef, intercept_um = fit_memories(sequences, columns, [folds[f] for f in which], self.zero_start)
             rest_um = sequences.y_um[..., None] - columns @ coef.T - intercept_um
             frame = {"spacing_s": spacing_s, "drivers": list(drivers)}
-            for some in alike([len(folds[f]) for f in which], [1] * len(which), self._most(*sequences.row[0].shape)):
-                stack = Stack.of(sequences, [folds[which[i]] for i in some], rest_um[..., some])
-                linear = [{"linear_um": coef[i], "intercept_um": float(intercept_um[i])} for i in some]
-                known = [part | frame | {"n_rows": rows[i]} for i, part in zip(some, linear, strict=True)]
-                out.append(_Lesson(stack, [(place, which[i]) for i in some], known))
+            for i, f in enumerate(which):
+                known = {"linear_um": coef[i], "intercept_um": float(intercept_um[i]), **frame, "n_rows": rows[i]}
+                out.append(_Lesson(Stack.of(sequences, folds[f], rest_um[..., i]), (place, f), known))
         return out
 
     def _learn(self, lessons: Sequence[_Lesson]) -> dict[tuple[int, int], Plain]:
@@ -233,18 +231,12 @@ class SequenceNet(Family):
             n_phases, _, p, n_steps, _ = lesson.stack.x.shape
             by_shape.setdefault((n_phases, n_steps, p), []).append(lesson)
         for (n_phases, n_steps, _), same in by_shape.items():
-            n_batches, n_nets = ([lesson.stack.x.shape[i] for lesson in same] for i in (-1, 1))
-            for group in alike(n_batches, n_nets, self._most(n_phases, n_steps)):
-                joined = [same[i] for i in group]
-                nets = self._trained(Stack.joined([lesson.stack for lesson in joined]))
-                places = [place for lesson in joined for place in lesson.places]
-                known = [part for lesson in joined for part in lesson.known]
-                out |= {at: part | net for at, part, net in zip(places, known, nets, strict=True)}
+            # A stack holds what fits a processor's cache.
+            most = _STACK_VALUES // (self.hidden * n_phases * n_steps)
+            for group in alike([lesson.stack.x.shape[-1] for lesson in same], most):
+                nets = self._trained(Stack.joined([same[i].stack for i in group]))
+                out |= {same[i].place: same[i].known | net for i, net in zip(group, nets, strict=True)}
         return out
-
-    def _most(self, n_phases: int, n_steps: int) -> int:
-        """Batches of all nets of a stack."""
-        return _STACK_VALUES // (self.hidden * n_phases * n_steps)
 
     def _trained(self, stack: Stack) -> list[Plain]:
         """What each net of a stack learned, for inputs in their own units."""

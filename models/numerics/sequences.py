@@ -137,28 +137,22 @@ class Stack:
     sigma_um: Array
 
     @classmethod
-    def of(cls, sequences: Sequences, folds: Sequence[Sequence[int]], rest_um: Array) -> Self:
-        """Folds of a design's batches; `rest_um` (K, R, T, F) is the target less each fold's linear part."""
-        n_batches = np.array([len(fold) for fold in folds])
-        most = int(n_batches.max())
-        batch = np.array([[*fold, *fold[:1] * (most - len(fold))] for fold in map(list, folds)])
-        real = np.arange(most) < n_batches[:, None]
-        known = sequences.known[batch] & real[:, :, None, None]
-        count = known.sum(axis=(1, 2, 3))
+    def of(cls, sequences: Sequences, fold: Sequence[int], rest_um: Array) -> Self:
+        """One net's: a fold of a design's batches; `rest_um` (K, R, T) is the target less the linear part."""
+        batches = list(fold)
+        x, known = sequences.x[batches], sequences.known[batches]
+        count = known.sum()
 
-        def rms(values: Array) -> Array:
-            return np.asarray(np.sqrt(np.where(known, values**2, 0.0).sum(axis=(1, 2, 3)) / count))
+        def rms(values: Array) -> float:
+            return float(np.sqrt(np.where(known, values[batches] ** 2, 0.0).sum() / count))
 
-        x = sequences.x[batch]
-        spread = np.sqrt(np.einsum("sbrtp,sbrt->sp", x**2, known) / count[:, None])
-        spread = np.maximum(spread, _LEAST_SPREAD)
-        rest = np.where(known, rest_um[batch, :, :, np.arange(len(folds))[:, None]], 0.0)
-        sigma_um = np.maximum(rms(rest), _LEAST_REST * rms(sequences.y_um[batch]))
-        sigma_um = np.where(sigma_um > 0, sigma_um, 1.0)
-        x = x / spread[:, None, None, None]
-        rest = rest / sigma_um[:, None, None, None]
-        return cls(np.ascontiguousarray(x.transpose(2, 0, 4, 3, 1)), np.ascontiguousarray(rest.transpose(2, 0, 3, 1)),
-                   known.transpose(2, 0, 3, 1).astype(float), n_batches, spread, sigma_um)  # fmt: skip
+        spread = np.maximum(np.sqrt(np.einsum("brtp,brt->p", x**2, known) / count), _LEAST_SPREAD)
+        sigma_um = max(rms(rest_um), _LEAST_REST * rms(sequences.y_um)) or 1.0
+        rest = np.where(known, rest_um[batches], 0.0) / sigma_um
+        one = np.newaxis
+        return cls(np.ascontiguousarray((x / spread).transpose(1, 3, 2, 0))[:, one], rest.transpose(1, 2, 0)[:, one],
+                   known.transpose(1, 2, 0)[:, one].astype(float), np.array([len(batches)]), spread[one],
+                   np.array([sigma_um]))  # fmt: skip
 
     @classmethod
     def joined(cls, stacks: Sequence[Self]) -> Self:
@@ -194,17 +188,17 @@ class Stack:
         return np.asarray(directions / np.where(rms > 0, rms, 1.0)[:, :, None])
 
 
-def alike(n_batches: Sequence[int], n_nets: Sequence[int], most: int) -> list[list[int]]:
-    """Stacks to train as one: places in the order of their numbers of batches, cut where these are half as many again,
-    where validation becomes possible, or where `most` batches are together."""
+def alike(n_batches: Sequence[int], most: int) -> list[list[int]]:
+    """Nets to train as one stack: places in the order of their numbers of batches, cut where these are half as many
+    again, where validation becomes possible, or where `most` batches are together."""
     groups: list[list[int]] = []
     size = 0
     for i in sorted(range(len(n_batches)), key=lambda i: n_batches[i]):
         least = n_batches[groups[-1][0]] if groups else 0
-        size += n_batches[i] * n_nets[i]
+        size += n_batches[i]
         if not groups or size > most or n_batches[i] > 1.5 * least or least < FEWEST_BATCHES <= n_batches[i]:
             groups.append([])
-            size = n_batches[i] * n_nets[i]
+            size = n_batches[i]
         groups[-1].append(i)
     return groups
 

@@ -109,8 +109,7 @@ def test_more_inputs_than_directions_still_use_every_input_itself() -> None:
 def test_a_stack_is_scaled_by_its_known_rows_and_fills_up_with_unknown_batches() -> None:
     design = make_design((9, 9, 9), p=2)
     s = Sequences.of(design, 1)
-    rest_um = np.stack([3.0 * s.y_um, s.y_um], axis=-1)
-    stack = Stack.of(s, [[0, 1, 2], [1]], rest_um)
+    stack = Stack.joined([Stack.of(s, [0, 1, 2], 3.0 * s.y_um), Stack.of(s, [1], s.y_um)])
     assert stack.x.shape == (1, 2, 2, 9, 3) and stack.n_batches.tolist() == [3, 1]
     assert stack.known[0, 1].sum() == 9 and stack.known[0, 1, :, 0].all()
     np.testing.assert_allclose(stack.spread[0], np.sqrt((design.x**2).mean(axis=0)))
@@ -122,7 +121,7 @@ def test_a_stack_is_scaled_by_its_known_rows_and_fills_up_with_unknown_batches()
 
 def test_halves_are_the_even_and_the_odd_batches() -> None:
     s = Sequences.of(make_design((4, 4, 4), p=1), 1)
-    stack = Stack.of(s, [[0, 1, 2]], s.y_um[..., None])
+    stack = Stack.of(s, [0, 1, 2], s.y_um)
     halves = stack.halves()
     np.testing.assert_array_equal(halves.x[0, 0, 0], stack.x[0, 0, 0][:, [0, 2]])
     np.testing.assert_array_equal(halves.x[0, 1, 0, :, 0], stack.x[0, 0, 0, :, 1])
