@@ -68,12 +68,6 @@ def _slope_name(name: str) -> str:
     return f"P·{name}"
 
 
-def fixed_ends_mm(low_mm: Array, high_mm: Array) -> Array:
-    """Candidates of P0 (S, 9) for travels from low to high (S,)."""
-    travel_mm = np.maximum(high_mm - low_mm, 1.0)
-    return low_mm[:, None] + travel_mm[:, None] * np.array(_BEYOND)
-
-
 def choose_terms(blocks: Blocks, ends_mm: Array, max_terms: int, worth: float) -> Chosen:
     """The model of a training set, of whose blocks sums about zero are given, with P0 among its candidates (C,).
 
@@ -211,7 +205,8 @@ class AxisCoupled(Family):
         low_mm, high_mm = np.full(design.n_batches, np.inf), np.full(design.n_batches, -np.inf)
         np.minimum.at(low_mm, design.group[read], position_mm[read])
         np.maximum.at(high_mm, design.group[read], position_mm[read])
-        return fixed_ends_mm(np.where(masks, low_mm, np.inf).min(axis=1), np.where(masks, high_mm, -np.inf).max(axis=1))
+        low_mm, high_mm = np.where(masks, low_mm, np.inf).min(axis=1), np.where(masks, high_mm, -np.inf).max(axis=1)
+        return low_mm[:, None] + np.maximum(high_mm - low_mm, 1.0)[:, None] * np.array(_BEYOND)
 
     def _plain(self, design: Design, chosen: Chosen) -> dict[str, Any]:
         p = len(design.inputs)

@@ -9,10 +9,10 @@ from typing import Self
 import numpy as np
 
 from data.arrays import Array
-from data.errors import InputError
 from data.sweeps import position_bins
 from features.design import Design
 from models.base import Family, Plain
+from models.numerics.batches import too_few_rows
 from models.program import Builder
 
 _NEED = 1  # rows
@@ -44,7 +44,7 @@ class MeanCurve(Family):
         for fold in folds:
             rows = np.flatnonzero(known & np.isin(design.group, list(fold)))
             if len(rows) < _NEED:
-                raise _nothing_recorded(design, sorted(set(fold)))
+                raise too_few_rows(self.key, design, sorted(set(fold)), len(rows), _NEED)
             bins = position_bins(position_mm[rows])
             at, which = np.unique(bins + 1j * time_s[rows], return_inverse=True)  # by position, then by time
             count = np.bincount(which)
@@ -89,14 +89,6 @@ def _on_line(at_mm: Array, position_mm: Array, table_um: Array) -> Array:
     share = np.clip((at_mm - position_mm[left]) / (position_mm[left + 1] - position_mm[left]), 0.0, 1.0)
     row = np.arange(len(at_mm))
     return np.asarray((1.0 - share) * table_um[left, row] + share * table_um[left + 1, row])
-
-
-def _nothing_recorded(design: Design, train: Sequence[int]) -> InputError:
-    names = ", ".join(design.batch_ids[k] for k in train) or "(none)"
-    return InputError(
-        f"mean_curve: batches {names} have 0 usable rows (target {design.target!r} recorded and not "
-        f"masked), expected at least {_NEED}; add batches"
-    )
 
 
 class Zero(Family):

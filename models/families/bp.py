@@ -80,8 +80,10 @@ class BP(Family):
         return [out[f] for f in range(len(folds))]
 
     def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        x = self.started(design).x
-        return [self._predict(x[design.rows(k)]) for k in batches]
+        f, x = self.fitted, self.started(design).x
+        nets = Nets(np.atleast_2d(np.asarray(f["nets"], float)), x.shape[1], self.hidden, self.transfer)
+        u = (x - np.asarray(f["x_mean"], float)) / np.asarray(f["x_spread"], float)
+        return [f["y_mean"] + f["y_spread"] * nets.outputs(u[design.rows(k)].T[None]).mean(axis=0) for k in batches]
 
     def operations(self, b: Builder) -> Sequence[int]:
         f, h, p = self.fitted, self.hidden, len(self.inputs)
@@ -96,13 +98,6 @@ class BP(Family):
 
     def n_parameters(self) -> int:
         return int(np.size(self.fitted["nets"]))
-
-    def _predict(self, x: Array) -> Array:
-        f = self.fitted
-        nets = Nets(np.atleast_2d(np.asarray(f["nets"], float)), x.shape[1], self.hidden, self.transfer)
-        u = (x - np.asarray(f["x_mean"], float)) / np.asarray(f["x_spread"], float)
-        out: Array = f["y_mean"] + f["y_spread"] * nets.outputs(u.T[None]).mean(axis=0)
-        return out
 
     def _stacks(self, counts: Sequence[int], n_inputs: int) -> list[list[int]]:
         """Folds in the order of their rows, cut where the rows double or the stack is full."""

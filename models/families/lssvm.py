@@ -80,7 +80,9 @@ class LSSVM(KernelExpansion):
         Raises:
             InputError: fewer than 2 usable rows in a fold.
         """
-        rows, batch = self._decimated(design)
+        most = max(_LEAST_ROWS_PER_BATCH, self.max_rows // max(1, design.n_batches))
+        rows = evenly(design, range(design.n_batches), most)
+        batch = design.group[rows]
         present = np.unique(batch)
         gaps = [np.flatnonzero(~np.isin(present, list(fold))) for fold in folds]
         # From 3 batches on the inner groups are batches; beyond a half a fold's own inverse is the cheaper one.
@@ -103,12 +105,6 @@ class LSSVM(KernelExpansion):
 
     def _problem(self, design: Design, rows: Sequence[Rows], layouts: Sequence[Rows]) -> _Problem:
         return _Problem.of(self.started(design), rows, layouts)
-
-    def _decimated(self, design: Design) -> tuple[Rows, Rows]:
-        """Rows kept, evenly over each batch's usable rows, and their batch."""
-        most = max(_LEAST_ROWS_PER_BATCH, self.max_rows // max(1, design.n_batches))
-        rows = evenly(design, range(design.n_batches), most)
-        return rows, design.group[rows]
 
     def _fit_shared(self, design: Design, rows: Rows, batch: Rows, gaps: dict[int, Rows]) -> dict[int, Self]:
         """Fold f leaves out the batches gaps[f]: its inner residuals are those of one more batch left out."""

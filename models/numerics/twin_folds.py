@@ -165,8 +165,9 @@ class Calibrations:
         kept = [k for k in key if k in self.used]
         at = [self.used[k] for k in kept]
         problem = self.problem.only(at)
-        if begin is None:
-            point = _from_file(problem, at)
+        if begin is None:  # at the machine file's values, with starts from the first readings
+            z, nuisance = np.zeros(len(problem.unknowns)), [np.zeros(q) for q in problem.nuisance_sizes]
+            point = _Point(at, z, nuisance, _linearised(problem, z, nuisance), z)
         else:
             place = [begin.at.index(i) for i in at]
             nuisance, blocks = [begin.nuisance[k] for k in place], [begin.blocks[k] for k in place]
@@ -211,12 +212,6 @@ def _refused(network: Network, batches: Sequence[Batch], every_s: float, channel
         except InputError as error:
             out[k] = str(error)
     return out
-
-
-def _from_file(problem: CalibrationProblem, at: list[int]) -> _Point:
-    """The machine file's values, with starts from the first readings."""
-    z, nuisance = np.zeros(len(problem.unknowns)), [np.zeros(q) for q in problem.nuisance_sizes]
-    return _Point(at, z, nuisance, _linearised(problem, z, nuisance), z)
 
 
 def _linearised(problem: CalibrationProblem, z: Array, nuisance: list[Array]) -> list[Block]:

@@ -173,11 +173,6 @@ class Losses:
                 out[own] *= alone + np.mean(1.0 - alone)
         return np.asarray(out / out.sum()) if out.any() else out
 
-    def without_each(self) -> tuple[list[str], Array]:
-        """The batches (K) and every cell's loss (C, K) as the other batches show it."""
-        ids = [str(k) for k in dict.fromkeys(self.batch_id)]
-        return ids, self.S_um @ np.column_stack([self.counted(k) for k in ids])
-
     def choosing_um(self) -> Array:
         """Cost of choosing among the cells of each family (C,)."""
         by_batch, share = self.by_batch(self.counted())
@@ -368,12 +363,13 @@ def score_of_choice(result: GridResult, rule: PromotionRule) -> pd.DataFrame:
     """
     columns = ["batch_id", "protocol", "cell", "S_um"]
     losses = Losses.of(result, rule)
-    ids, loss_um = losses.without_each()
+    ids = [str(k) for k in dict.fromkeys(losses.batch_id)]
     if len(ids) < 3 or (losses.protocol == "train-on-one").all():
         return pd.DataFrame(columns=columns)
     rows = []
-    for k, own_um in zip(ids, loss_um.T, strict=True):
-        c = _least(losses, own_um, losses.counted(k))
+    for k in ids:
+        counted = losses.counted(k)
+        c = _least(losses, losses.S_um @ counted, counted)
         cell = "|".join(str(v) for v in losses.cells.loc[c, KEYS])
         rows += [(k, losses.protocol[r], cell, losses.S_um[c, r]) for r in np.flatnonzero(losses.batch_id == k)]
     return pd.DataFrame(rows, columns=columns)

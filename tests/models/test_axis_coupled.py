@@ -260,7 +260,7 @@ def test_the_mean_curve_along_an_axis_is_one_curve_for_each_position() -> None:
     np.testing.assert_allclose(model.predict(between), (curves[0] + curves[1]) / 2)
     beyond = replace(run(3), table=run(3).table.assign(at=99.0))
     np.testing.assert_allclose(model.predict(beyond), curves[1])
-    with pytest.raises(InputError, match="mean_curve: batches b1 have 0 usable rows"):
+    with pytest.raises(InputError, match="mean_curve: got 0 usable rows of x in b1"):
         dead = replace(run(1), table=run(1).table.assign(x=np.nan))
         MeanCurve().fit([dead], (), "x")
 

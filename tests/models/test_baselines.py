@@ -52,9 +52,9 @@ def test_mean_curve_ignores_the_order_and_repetition_of_batches():
 
 def test_mean_curve_without_any_error_is_told():
     design = make_design([[nan, nan], [0, 1]])
-    with pytest.raises(InputError, match=r"mean_curve: batches K1 have 0 usable rows \(target 'z_um' recorded"):
+    with pytest.raises(InputError, match="family mean_curve: got 0 usable rows of z_um in K1, need"):
         MeanCurve().fit_folds(design, [[1], [0]])
-    with pytest.raises(InputError, match=r"mean_curve: batches \(none\) have 0 usable rows"):
+    with pytest.raises(InputError, match="mean_curve: got 0 usable rows of z_um in no batch"):
         MeanCurve().fit_design(design, [])
 
 
