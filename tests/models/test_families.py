@@ -102,7 +102,7 @@ def by_hand() -> Design:
 
 @pytest.mark.parametrize(("key", "options"), [
     *((key, {}) for key in ("mlr", "ridge", "pcr", "pcr_lbo", "pls", "bp", "bp_linear", "gaussian_process")),
-    ("transfer_function", {}), ("transfer_function", {"drivers": True}),
+    ("transfer_function", {}), ("transfer_function", {"drivers": True}), ("lssvm", {}), ("lssvm", {"max_rows": 45}),
 ])  # fmt: skip
 @pytest.mark.parametrize("form", ["default", "published"])
 def test_all_folds_at_once_are_the_folds_one_by_one(key: str, options: dict[str, Any], form: str) -> None:

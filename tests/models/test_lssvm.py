@@ -167,23 +167,6 @@ def test_nested_choice_is_the_brute_force_choice():
         assert model.fitted["inner_rms_um"] == pytest.approx(score, rel=1e-6)
 
 
-@pytest.mark.parametrize("max_rows", [480, 45])
-def test_folds_at_once_are_the_folds_alone(max_rows):
-    design = make_design(4, sizes=(14, 9, 12, 11, 13, 10))
-    folds = [[1, 2, 3, 4, 5], [0, 1, 2, 4, 5], [0, 2, 3, 5], [4], [1, 2], [0, 1, 2, 3, 4, 5]]
-    family = LSSVM(max_rows=max_rows, **SMALL)
-    together = family.fit_folds(design, folds)
-    everything = range(6)
-    columns = family.predict_folds(design, together, [everything] * len(folds))
-    for f, (fold, model) in enumerate(zip(folds, together, strict=True)):
-        alone = family.fit_design(design, fold)
-        assert alone.fitted["gamma"] == model.fitted["gamma"] and alone.fitted["sigma"] == model.fitted["sigma"]
-        want = np.concatenate(alone.predict_design(design, everything))
-        np.testing.assert_allclose(np.concatenate(model.predict_design(design, everything)), want, atol=1e-8)
-        np.testing.assert_allclose(np.concatenate(columns[f]), want, atol=1e-8)
-        assert len(model.fitted["alpha"]) <= max(max_rows, 8 * len(fold)) + 1  # and the start
-
-
 @pytest.mark.parametrize("fold", [[0, 1, 2, 3], [4]])
 def test_the_swarm_finds_at_least_what_the_grid_finds_and_its_score_is_that_of_refits(fold):
     design = make_design(10)
