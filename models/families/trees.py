@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from data.arrays import Array
-from features.design import Design, decimated_rows
+from features.design import Design
 from models.base import Family, Plain, inner_groups
 from models.numerics.batches import too_few_rows
+from models.numerics.kernels import Rows, evenly
 from models.program import Builder
 
 _FEWEST = 4
@@ -74,14 +75,14 @@ class TreeEnsemble(Family):
     averaged: ClassVar[bool]  # the mean of the trees, grown in single precision; False: base_um and their sum
     max_rows: int
 
-    def training_rows(self, design: Design, train: Sequence[int]) -> NDArray[np.int64]:
+    def training_rows(self, design: Design, train: Sequence[int]) -> Rows:
         """Usable rows of the batches `train`, evenly at most `max_rows` of each, more where the batches are few.
 
         Raises:
             InputError: fewer than 4 usable rows.
         """
         each = max(self.max_rows, self.most_of_few // max(1, len(train)))
-        out = np.concatenate([np.empty(0, np.int64), *decimated_rows(design, train, each)])
+        out = evenly(design, sorted(train), each)
         if len(out) < _FEWEST:
             raise too_few_rows(self.key, design, train, len(out), _FEWEST)
         return out
