@@ -22,7 +22,6 @@ from pipelines.commands.ingest import ingest
 from pipelines.commands.lake import app as lake
 from pipelines.commands.predict import predict
 from pipelines.commands.registry import promote, registry, rollback
-from pipelines.commands.replay import replay
 from pipelines.commands.report import report
 from pipelines.commands.schedule import schedule
 from pipelines.commands.simulate import simulate
@@ -40,7 +39,7 @@ app = typer.Typer(
 )
 COMMANDS: tuple[Callable[..., None], ...] = (
     describe, ingest, train, report, promote, rollback, status, registry, predict, rehearse, compensate, export,
-    replay, schedule, simulate, calibrate, diagnose, demonstrate,
+    schedule, simulate, calibrate, diagnose, demonstrate,
 )  # fmt: skip
 for command in COMMANDS:
     app.command()(command)

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
         read,
         registry,
         rehearse,
-        replay,
         sample_year,
         save_model,
         simulate,
@@ -45,7 +44,7 @@ if TYPE_CHECKING:
 __all__ = [
     "FAMILIES", "MECHANISMS", "SELECTORS", "CalibrationOptions", "Lake", "Plan", "__version__", "calibrate", "cross",
     "diagnose", "export", "ingest", "leaderboard", "load_machine", "load_model", "predict", "read", "registry",
-    "rehearse", "replay", "sample_year", "save_model", "simulate", "testing", "train",
+    "rehearse", "sample_year", "save_model", "simulate", "testing", "train",
 ]  # fmt: skip
 _MODULES = {
     "CalibrationOptions": "twin.calibration", "FAMILIES": "models.families", "Lake": "data.lake",

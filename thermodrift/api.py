@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from diagnosis.result import Diagnosis
     from models.base import Family
     from models.selection.crossing import Plan
-    from models.selection.replay import Replay
     from models.selection.result import GridResult
     from pipelines.commands.simulate import Simulated
     from pipelines.jobs.training import TrainOutcome
@@ -280,47 +279,6 @@ def rehearse(
 
         write_rehearsal(Path(out), done, labelled([str(n) for n in names], known), Account.of(batches).summary)
     return done
-
-
-def replay(
-    machine_file: Path | str,
-    recordings: Paths,
-    out: Path | str,
-    *,
-    channels: Sequence[str] = (),
-    plan: Plan | None = None,
-    start: int = 8,
-    every: int = 4,
-    disturb: int | None = None,
-    processes: int = 1,
-) -> Replay:
-    """Let a year of recordings arrive run by run in a home of its own: retrain, promote, and predict each run first.
-
-    Args:
-        out: folder of the replay; replay.html and replay.json are written there. A replay that was stopped goes on.
-        channels: error channels to learn; default: all.
-        plan: selectors, families, protocols and effort; default: those of quick effort.
-        start: runs of the first training.
-        every: new runs from one training to the next.
-        disturb: seed of a plan in which runs come late, twice, out of order, or faulty at first; None: as recorded.
-
-    Returns:
-        Trainings and runs with the error of the champion, of the first champion and of no model (µm); `score` sums
-        them up.
-
-    Raises:
-        InputError: a file, channel or plan that cannot be used, too few runs, or `out` holds something else.
-        WorkError: `out` cannot be written.
-    """
-    from models.selection.crossing import Plan
-    from pipelines.commands.replay import replay_year
-    from pipelines.jobs.replay import ReplayRequest
-
-    request = ReplayRequest(
-        Path(machine_file), tuple(_paths(recordings)), Path(out), tuple(channels), plan or Plan(effort="quick"), start,
-        every, disturb, processes,
-    )  # fmt: skip
-    return replay_year(request, _log, lambda step, n, of: None)
 
 
 def export(models: Paths, to: str, out: Path | str | None = None, *, provisional: bool = False) -> list[Path]:

@@ -1,1 +1,1 @@
-"""The work of one command: training, diagnosis, replay, compensation, and what each is given."""
+"""The work of one command: training, diagnosis, compensation, and what each is given."""
