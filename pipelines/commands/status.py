@@ -184,8 +184,7 @@ def _deliver() -> None:
     from pipelines.store import spool
 
     configured = settings.load()
-    for done in spool.deliver(configured, partial(promote_waiting, configured), console.note):
-        console.note(done.line)
+    spool.deliver(configured, partial(promote_waiting, configured), console.note)
 
 
 def _gathered(quiet: bool) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from datetime import datetime
 from functools import partial
 from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Protocol
 
 import numpy as np
@@ -35,6 +36,7 @@ from pipelines.jobs.inputs import INPUTS, Inputs
 from pipelines.jobs.recordings import Gathered, check_recordings, gather_batches
 from pipelines.settings import Settings, home
 from pipelines.store import spool, tracking
+from pipelines.store.runs import Record
 from reports.diagnosis.first_screen import Continued
 from twin.compile import compile_network
 from twin.schema import Calibrated
@@ -151,8 +153,13 @@ def finished(
     inputs = Inputs.of(machine.machine, request.machine_file, text, request.seed, batches)
     files, trouble = write_diagnosis(found, request.out, text, request.report, inputs, continued)
     say("track")
-    track = partial(_track, found, batches, request, settings, say)
-    run_id = caller.map("track", track, [files], retries=RETRIES)[0]
+    options = {"machine_file": request.machine_file.name, "seed": request.seed}
+    record = tracking.diagnosis_record(found, batches, options)
+    try:
+        run_id = caller.map("track", partial(_track, record, settings, say), [files], retries=RETRIES)[0]
+    except WorkError as error:
+        spool.keep(settings, record, lambda item: _copy(files, item / spool.ARTIFACTS))
+        raise WorkError(f"{error}; {spool.reminder(settings)}; the diagnosis is written to {request.out}") from None
     return DiagnosisOutcome(found, request.out, files, run_id, gathered.ingested, trouble, continued)
 
 
@@ -288,25 +295,15 @@ def library_diagnosis() -> Diagnose:
     return diagnose
 
 
-def _track(
-    d: Diagnosis,
-    batches: list[Batch],
-    request: DiagnosisRequest,
-    settings: Settings,
-    say: Say,
-    files: Mapping[str, Path],
-) -> str:
-    params = {"machine_file": request.machine_file.name, "seed": request.seed}
-    record = tracking.diagnosis_record(d, batches, params)
+def _track(record: Record, settings: Settings, say: Say, files: Mapping[str, Path]) -> str:
+    with TemporaryDirectory() as folder:
+        _copy(files, Path(folder))
+        return tracking.log_record(record, Path(folder), settings, say)
 
-    def fill(to: Path) -> None:
-        for path in files.values():
-            shutil.copy(path, to)
 
-    try:
-        return spool.hand_over(settings, "run", record, fill, say=say).run_id
-    except WorkError as error:
-        raise WorkError(f"{error}; the diagnosis is written to {request.out}") from None
+def _copy(files: Mapping[str, Path], folder: Path) -> None:
+    for path in files.values():
+        shutil.copy(path, folder)
 
 
 def _check_same_machine(path: Path, machine: str) -> None:

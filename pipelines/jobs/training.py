@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import pandas as pd
@@ -82,9 +83,9 @@ def train(
 ) -> TrainOutcome:
     """Run the yearly job.
 
-    The tracking store is reached first, and gets what waits for it. Every result is kept before it is delivered (see
-    `pipelines.store.spool`), so that nothing is lost if the store goes away. After any other failure the crossing is
-    kept.
+    The tracking store is reached first, and gets what waits for it. If it goes away later, the results wait for it (see
+    `pipelines.store.spool`). After any other failure, and when the process is killed, the crossing is kept until
+    tracking, promotion and report are done: the same command goes on, and nothing is tracked twice.
 
     Args:
         caller: how the steps run.
@@ -97,8 +98,7 @@ def train(
     machine, targets = check_request(request, settings)
     started_ms = now_ms()
     tracking.open_store(settings, say)
-    for done in spool.deliver(settings, partial(promote_waiting, settings), say):
-        say(done.line)
+    spool.deliver(settings, partial(promote_waiting, settings), say)
     plan = request.plan.suited(machine)
     outcome = TrainOutcome(machine.machine, machine.simulated)
     outcome.units |= {t: machine.channels[t].unit for t in targets}
@@ -113,7 +113,7 @@ def train(
         batches = load_batches(lake, machine)
         _check_several(batches, machine)
     outcome.account = Account.of(batches)
-    if request.only_if_new and _seen_before(machine.machine, targets, batches, settings):
+    if request.only_if_new and _seen_before(request, machine.machine, targets, batches, settings):
         outcome.stopped = "the last training saw the same batches; nothing new to learn"
         return outcome
     say(f"features and selectors of {len(batches)} batches")
@@ -143,18 +143,23 @@ def train(
         token = checkpoint.token()
         for t in targets:
             outcome.records[t] = _record(outcome, plan, settings, t, f"{token}-{t}", started_ms)
-        caller.map("track", partial(_track, outcome, settings), targets, retries=RETRIES)
+        track = partial(_while_there, outcome, partial(_track, outcome, settings))
+        caller.map("track", track, targets, retries=RETRIES)
         clock("track")
         if request.promote:
             say("promote")
             promote = partial(_promote, outcome, crossings, request.machine_file, settings)
-            caller.map("promote", promote, targets, retries=RETRIES)
+            caller.map("promote", partial(_while_there, outcome, promote), targets, retries=RETRIES)
             clock("promote")
         say("report")
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         path = request.report or home() / "reports" / f"{machine.machine}-{stamp}.html"
         outcome.report = caller.map("report", partial(_report, outcome, settings), [path])[0]
         clock("report")
+        if outcome.postponed:
+            for t in targets:
+                spool.keep(settings, outcome.records[t], partial(_fill, outcome, request, t))
+            outcome.postponed += f"; {spool.reminder(settings)}"
     checkpoint.remove()
     stopping.note(None)
     if machine.twin is not None:
@@ -234,10 +239,13 @@ class _Clock:
         self.into[step], self.last = round(now - self.last, 2), now
 
 
-def _seen_before(machine: str, targets: Sequence[str], batches: Sequence[Batch], settings: Settings) -> bool:
+def _seen_before(
+    request: TrainRequest, machine: str, targets: Sequence[str], batches: Sequence[Batch], settings: Settings
+) -> bool:
+    """Whether the last training of every channel saw these batches and, where one is due, has its promotion."""
     for target in targets:
         past = tracking.trainings(machine, target, settings, newest=1)
-        if past.empty:
+        if past.empty or (request.promote and not past.iloc[0]["promotion"]):
             return False
         last = tracking.load_training(str(past.iloc[0]["training_id"]), settings)
         if set(last.result.batches["digest"]) != {b.digest for b in with_target(batches, target)}:
@@ -287,10 +295,24 @@ def _record(
     )  # fmt: skip
 
 
+def _while_there(outcome: TrainOutcome, work: Callable[[str], None], target: str) -> None:
+    """`work` on a channel until the store goes away: what is left waits, see `pipelines.store.spool`."""
+    if not outcome.postponed:
+        try:
+            work(target)
+        except StoreOutage as error:
+            outcome.postponed = str(error)
+
+
 def _track(outcome: TrainOutcome, settings: Settings, target: str) -> None:
+    with TemporaryDirectory() as folder:
+        _write_artifacts(outcome, target, Path(folder))
+        outcome.training_ids[target] = tracking.log_record(outcome.records[target], Path(folder), settings)
+
+
+def _write_artifacts(outcome: TrainOutcome, target: str, folder: Path) -> None:
     result = outcome.results[target]
-    figures = figure_pngs(result)
-    _hand_over(outcome, settings, target, "run", lambda to: tracking.training_files(to, result, figures))
+    tracking.training_files(folder, result, figure_pngs(result))
 
 
 def _promote(
@@ -298,48 +320,28 @@ def _promote(
 ) -> None:
     choice, crossing, result = outcome.choices[target], crossings[target], outcome.results[target]
     text = machine_file.read_text(encoding="utf-8")
-
-    def promote(training_id: str, _: Path) -> registry.Promotion:
-        family = refit(crossing, choice.selector, choice.family, choice.n_tsp, result.stack)
-        region = Region.of(crossing.batches, family.inputs)
-        new = registry.Newcomer(result, choice, family, text, training_id, region, crossing.batches)
-        return registry.promote(new, settings)
-
-    def fill(to: Path) -> None:
-        (to / spool.MACHINE).write_text(text, encoding="utf-8")
-
-    _hand_over(outcome, settings, target, "promotion", fill, promote)
+    family = refit(crossing, choice.selector, choice.family, choice.n_tsp, result.stack)
+    region = Region.of(crossing.batches, family.inputs)
+    new = registry.Newcomer(result, choice, family, text, outcome.training_ids[target], region, crossing.batches)
+    outcome.promotions[target] = registry.promote(new, settings)
 
 
 def _report(outcome: TrainOutcome, settings: Settings, path: Path) -> Path:
     """Write the report, which every training keeps as an artifact."""
     written = write_report([_training(outcome, t) for t in outcome.results], path, settings.promotion)
     for target in outcome.records:
-        _hand_over(outcome, settings, target, "file", lambda to: shutil.copy(written, to))
+        _while_there(outcome, lambda t: tracking.attach(outcome.training_ids[t], written, settings), target)
     return written
 
 
-def _hand_over(
-    outcome: TrainOutcome,
-    settings: Settings,
-    target: str,
-    kind: spool.Kind,
-    fill: Callable[[Path], object],
-    promote: spool.Promote[registry.Promotion] | None = None,
-) -> None:
-    """A result of a channel to the store; after an outage of it the result only waits, see `pipelines.store.spool`."""
-    record = outcome.records[target]
-    if outcome.postponed:
-        spool.keep(settings, kind, record, fill)
-        return
-    try:
-        done = spool.hand_over(settings, kind, record, fill, promote)
-    except StoreOutage as error:
-        outcome.postponed = str(error)
-        return
-    outcome.training_ids[target] = done.run_id
-    if done.promoted is not None:
-        outcome.promotions[target] = done.promoted
+def _fill(outcome: TrainOutcome, request: TrainRequest, target: str, item: Path) -> None:
+    """What the store needs of a training that waits."""
+    _write_artifacts(outcome, target, item / spool.ARTIFACTS)
+    if outcome.report is not None:
+        (item / spool.REPORT).mkdir()
+        shutil.copy(outcome.report, item / spool.REPORT)
+    if request.promote and target not in outcome.promotions:
+        shutil.copyfile(request.machine_file, item / spool.MACHINE)
 
 
 def _training(outcome: TrainOutcome, target: str) -> Training:

@@ -127,14 +127,6 @@ def write_record(client: MlflowClient, settings: Settings, record: Record, files
     return run_id
 
 
-def find_record(client: MlflowClient, settings: Settings, record_id: str, machine: str, target: str) -> str | None:
-    """The finished run of a record, None where the store has none."""
-    experiment = find_experiment(client, settings, machine, target)
-    runs = [] if experiment is None else _runs_of(client, experiment.experiment_id, record_id)
-    done = (r.info.run_id for r in runs if r.info.status == "FINISHED" and PARENT not in r.data.tags)
-    return next(done, None)
-
-
 def close_interrupted(client: MlflowClient) -> int:
     """Mark as killed what ended processes of this computer left running; returns the number of runs."""
     left = [r for r in _runs(client, "attributes.status = 'RUNNING'") if _is_gone(r)]

@@ -243,14 +243,14 @@ def test_what_is_not_tracked_is_told(
         raise WorkError("tracking store sqlite:///x: database is locked")
 
     with monkeypatch.context() as patch:
-        patch.setattr("pipelines.store.spool.log_record", broken)
+        patch.setattr("pipelines.store.tracking.log_record", broken)
         done = diagnose("--no-report")
     out = tmp_path / "out"
-    assert (done.code, one_line(done)) == (
-        1, f"tracking store sqlite:///x: database is locked; the diagnosis is written to {out}"
-    )  # fmt: skip
+    said = one_line(done)
+    assert done.code == 1 and said.startswith("tracking store sqlite:///x: database is locked; 1 results wait in ")
+    assert said.endswith(f" delivers them; the diagnosis is written to {out}")
     assert (out / "findings.json").exists()
-    assert "delivered run of " in call("status").err  # it waited
+    assert "delivered diagnosis of " in call("status").err  # it waited
 
 
 def test_a_recording_that_cannot_be_used_is_told(call: Call, toy: Toy, given: Path, tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from pipelines.caller import DirectCaller
 from pipelines.jobs.request import TrainRequest
 from pipelines.jobs.training import train
 from pipelines.settings import NamesPart, Settings
-from pipelines.store import checkpoint, database, model_store, registry, spool, tracking
+from pipelines.store import checkpoint, database, model_store, registry, tracking
 from tests.toys.command import in_process
 from tests.toys.small_year import write_machine, write_year
 from tests.toys.tracked import log_training
@@ -143,7 +143,7 @@ def test_a_disk_that_is_full_at_a_step_keeps_the_crossing(
     )
     point = {
         "crossing": (checkpoint, "_write"), "artifacts": (MlflowClient, "log_artifacts"),
-        "report": (spool, "attach"),
+        "report": (tracking, "attach"),
     }[where]  # fmt: skip
     with monkeypatch.context() as patch, pytest.raises(WorkError) as caught:
         patch.setattr(*point, full)

@@ -207,8 +207,8 @@ def test_after_a_killed_promotion_nothing_is_crossed_or_tracked_again(
     outcome = train(request, store, DirectCaller(), said.append)
     assert any(line.startswith("resumes: 2 finished parts") for line in said)
     assert outcome.training_ids == {"z": tracked}
-    promoted = outcome.promotions["z"]  # the one that was kept is delivered before anything else
-    assert (promoted.outcome, promoted.version, promoted.champion_version) == ("unchanged", 1, 1)
+    promoted = outcome.promotions["z"]
+    assert (promoted.outcome, promoted.version, promoted.champion_version) == ("champion", 1, 1)
     assert tracking.trainings("small-killed", None, store)["training_id"].tolist() == [tracked]
     assert not list((store_home / "unfinished").glob("*/z__ridge"))
 

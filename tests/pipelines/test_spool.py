@@ -1,4 +1,4 @@
-"""Results on their way to the store: kept first, delivered once, whatever ends a process or a server."""
+"""Results on their way to the store: delivered once, whatever ends a process or a server."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ from pipelines.caller import DirectCaller
 from pipelines.commands.train import training_dict
 from pipelines.jobs.recordings import home_lake
 from pipelines.jobs.request import TrainRequest
-from pipelines.jobs.training import promote_waiting, train
+from pipelines.jobs.training import TrainOutcome, promote_waiting, train
 from pipelines.store import registry, spool, tracking
 from pipelines.store.database import StoreOutage
+from pipelines.store.runs import Record
 from tests.toys.command import Call, in_process
 from tests.toys.mlflow_server import MlflowServer
 from tests.toys.postgres import free_port
@@ -48,9 +49,12 @@ def down(*_: object, **__: object) -> Any:
     raise StoreOutage(DOWN)
 
 
-def trained(name: str, folder: Path, store: Any, caller: DirectCaller | None = None) -> Any:
+def trained(
+    name: str, folder: Path, store: Any, caller: DirectCaller | None = None, only_if_new: bool = False
+) -> TrainOutcome:
     machine, _ = write_machine(folder / "m.yml", name), write_year(folder / "in")
-    return train(TrainRequest(machine, (folder / "in",), ("z",), PLAN, workers=1), store, caller or DirectCaller())
+    request = TrainRequest(machine, (folder / "in",), ("z",), PLAN, only_if_new=only_if_new, workers=1)
+    return train(request, store, caller or DirectCaller())
 
 
 def test_a_server_that_does_not_answer_is_one_line_before_anything_is_computed(call: Call, tmp_path: Path) -> None:
@@ -68,22 +72,20 @@ def test_results_wait_and_are_delivered_once(
 ) -> None:
     monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
     with monkeypatch.context() as patch:
-        patch.setattr(spool, "log_record", down)
+        patch.setattr(tracking, "log_record", down)
         outcome = trained("small-spool", tmp_path, store)
     assert outcome.postponed.startswith(f"{DOWN}; 1 results wait in {store_home / 'spool'}: the next `thermodrift ")
     assert training_dict(outcome)["postponed"] == outcome.postponed
     assert not outcome.training_ids and not outcome.promotions and outcome.report.exists()
-    names = [p.name for p in spool.waiting(store)]
-    assert names == ["000001-run-small-spool-z", "000002-promotion-small-spool-z", "000003-file-small-spool-z"]
+    assert [p.name for p in spool.waiting(store)] == [f"{outcome.records['z'].started_ms}-small-spool-z"]
     assert tracking.trainings("small-spool", None, store).empty
     kept = tmp_path / "kept"
     shutil.copytree(store_home / "spool", kept)
 
     done = call("status", "--json")
-    assert done.code == 0 and [line.partition(":")[0] for line in done.err.splitlines()[:4]] == [
-        "delivers 3 results that the tracking store does not have yet",
-        *(f"delivered {kind} of small-spool z" for kind in ("run", "promotion", "file")),
-    ]
+    assert done.code == 0 and [line.partition(":")[0] for line in done.err.splitlines()[:2]] == [
+        "delivers 1 results that the tracking store does not have yet", "delivered training of small-spool z"
+    ]  # fmt: skip
     (training,) = [t for t in json.loads(done.out)["trainings"] if t["machine"] == "small-spool"]
     assert (training["promotion"], training["model"]) == ("champion", "small-spool-z version 1")
     client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
@@ -94,9 +96,8 @@ def test_results_wait_and_are_delivered_once(
     assert (Path(folder) / "grid" / "result.json").exists() and list((Path(folder) / "figures").iterdir())
     assert not spool.waiting(store)
 
-    shutil.copytree(
-        kept, store_home / "spool", dirs_exist_ok=True
-    )  # as if the delivery had died before it removed them
+    # as if the delivery had died before it removed them
+    shutil.copytree(kept, store_home / "spool", dirs_exist_ok=True)
     spool.deliver(store, partial(promote_waiting, store))
     assert not spool.waiting(store)
     table = tracking.trainings("small-spool", None, store)
@@ -113,31 +114,32 @@ def test_a_promotion_that_does_not_reach_the_server_waits_and_one_that_is_refuse
         patch.setattr(registry, "promote", down)
         outcome = trained("small-later", tmp_path, store)
     assert list(outcome.training_ids) == ["z"] and not outcome.promotions and outcome.postponed.startswith(DOWN)
-    assert [p.name[:16] for p in spool.waiting(store)] == ["000001-promotion", "000002-file-smal"]
-    with monkeypatch.context() as patch, pytest.raises(StoreOutage, match=r"refused\); 2 results wait in "):
-        patch.setattr(spool, "open_store", down)
+    with monkeypatch.context() as patch, pytest.raises(StoreOutage, match=r"refused\); 1 results wait in "):
+        patch.setattr(spool, "log_record", down)
         spool.deliver(store, partial(promote_waiting, store))
-    assert len(spool.waiting(store)) == 2
     home_lake().forget_machine("small-later", "sold")
-    promotion, report = spool.deliver(store, partial(promote_waiting, store))
-    line = promotion.line
-    assert line.startswith("not delivered: promotion of small-later z (lake ") and "is withdrawn (sold)" in line
+    said: list[str] = []
+    spool.deliver(store, partial(promote_waiting, store), said.append)
+    assert said[1].startswith("not delivered: training of small-later z (lake ") and "is withdrawn (sold)" in said[1]
     (refused,) = (store_home / "spool" / "refused").iterdir()
-    assert (refused / "reason.txt").read_text().strip() in line and not spool.waiting(store)
-    assert report.line.startswith("delivered file of small-later z: small-later-")
+    assert (refused / "reason.txt").read_text().strip() in said[1] and not spool.waiting(store)
+    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    assert client.list_artifacts(outcome.training_ids["z"], "report")
+
+
+def toy_record(machine: str, store: Any) -> Record:
+    result = toy_result(toy_batches(machine, 3), {"none|mlr|2": [1.0, 2.0, 1.5]})
+    return tracking.training_record(result, store.promotion)
 
 
 def test_what_cannot_be_delivered_now_waits_with_what_follows_it_and_other_channels_do_not(
     store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As on a full disk: nothing is refused for good, and the order of a channel's results stays."""
-    own = replace(store, home=tmp_path)
-    for name in ("toy-a", "toy-b"):
-        record = tracking.training_record(
-            toy_result(toy_batches(name, 3), {"none|mlr|2": [1.0, 2.0, 1.5]}), store.promotion
-        )
-        spool.keep(own, "run", record, lambda to: None)
-        spool.keep(own, "file", record, lambda to: (to / "report.html").write_text("page"))
+    own, names = replace(store, home=tmp_path), ("toy-a", "toy-a", "toy-b")
+    for k, name in enumerate(names):
+        record = toy_record(name, store)
+        spool.keep(own, record.model_copy(update={"started_ms": record.started_ms + k}), lambda item: None)
     log = spool.log_record
 
     def full(record: Any, *rest: Any) -> str:
@@ -145,55 +147,50 @@ def test_what_cannot_be_delivered_now_waits_with_what_follows_it_and_other_chann
             raise WorkError(f"{tmp_path}: cannot be written or read (No space left on device)")
         return log(record, *rest)
 
+    said: list[str] = []
     with monkeypatch.context() as patch:
         patch.setattr(spool, "log_record", full)
-        lines = [d.line for d in spool.deliver(own, partial(promote_waiting, own))]
-    assert [line.partition("(")[0].partition(":")[0] for line in lines] == [
-        "not delivered", "delivered run of toy-b z", "delivered file of toy-b z"
+        spool.deliver(own, partial(promote_waiting, own), said.append)
+    assert [line.partition("(")[0].partition(":")[0] for line in said[1:]] == [
+        "not delivered", "delivered training of toy-b z"
     ]  # fmt: skip
-    assert "No space left on device)); it waits in " in lines[0]
-    assert [p.name for p in spool.waiting(own)] == ["000001-run-toy-a-z", "000002-file-toy-a-z"]
-    assert len(spool.deliver(own, partial(promote_waiting, own))) == 2 and not spool.waiting(own)
+    assert "No space left on device)); it waits in " in said[1]
+    assert [p.name.partition("-")[2] for p in spool.waiting(own)] == ["toy-a-z", "toy-a-z"]
+    spool.deliver(own, partial(promote_waiting, own))
+    assert not spool.waiting(own) and len(tracking.trainings("toy-a", None, store)) == 2
 
 
-@pytest.mark.parametrize(
-    "lost", ["promote", *(pytest.param(step, marks=pytest.mark.slow) for step in ("track", "report"))]
-)
-def test_a_training_that_is_killed_after_a_result_was_kept_loses_nothing(
-    lost: str, store: Any, store_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("step", [pytest.param("log_record", marks=pytest.mark.slow), "promote"])
+def test_a_training_that_is_killed_before_the_store_has_it_goes_on(
+    step: str, store: Any, store_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every result is kept before it is delivered: the next command delivers it."""
+    """The next round of a schedule finds no new batches, and a training that is not finished."""
     monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
-    name = f"small-killed-{lost}"
-    kind = {"track": "run", "promote": "promotion", "report": "file"}[lost]
-    deliver = spool._delivered
+    name = f"small-killed-{step.replace('_', '-')}"
 
-    def killed(settings: Any, path: Path, item: Any, *rest: Any) -> Any:
-        if item.kind == kind:
-            raise KeyboardInterrupt
-        return deliver(settings, path, item, *rest)
+    def killed(*_: object, **__: object) -> Any:
+        raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(spool, "_delivered", killed)
+        patch.setattr(tracking if step == "log_record" else registry, step, killed)
         trained(name, tmp_path, store)
-    assert [p.name.split("-")[1] for p in spool.waiting(store)] == [kind]
-    again = trained(name, tmp_path, store)
-    assert not spool.waiting(store) and not again.postponed
+    assert not spool.waiting(store)
+    again = trained(name, tmp_path, store, only_if_new=True)
     table = tracking.trainings(name, None, store)
     assert table["training_id"].tolist() == [again.training_ids["z"]] and table["promotion"].tolist() == ["champion"]
     versions = registry.status(store)
     assert versions[versions["name"] == f"{name}-z"]["version"].tolist() == [1]
+    assert trained(name, tmp_path, store, only_if_new=True).stopped
 
 
 def test_no_item_is_half_written(store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    result = toy_result(toy_batches("toy-torn", 3), {"none|mlr|2": [1.0, 2.0, 1.5]})
-    record, own = tracking.training_record(result, store.promotion), replace(store, home=tmp_path)
+    record, own = toy_record("toy-torn", store), replace(store, home=tmp_path)
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
         patch.setattr(Path, "write_text", _full)
-        spool.keep(own, "run", record, lambda to: None)
-    assert not [p for p in spool.folder(own).iterdir() if p.is_dir()]
-    spool.keep(own, "run", record, lambda to: None)
-    spool.keep(own, "run", record, lambda to: None)  # waits already
+        spool.keep(own, record, lambda item: None)
+    assert not list(spool.folder(own).iterdir())
+    spool.keep(own, record, lambda item: None)
+    spool.keep(own, record, lambda item: None)  # waits already
     assert len(spool.waiting(own)) == 1
 
 
