@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -23,15 +22,12 @@ class Registry(Mapping[str, Any]):
 
     def __init__(self, kind: str, members: Mapping[str, str]) -> None:
         self.kind = kind
-        self._members: dict[str, Any] = dict(members)
+        self._members = dict(members)
 
     def __getitem__(self, key: str) -> Any:
         if key not in self._members:
             raise InputError(f"unknown {self.kind} {key!r}: {closest(key, self._members)}")
-        where = self._members[key]
-        if not isinstance(where, str):
-            return where
-        module, name = where.split(":")
+        module, name = self._members[key].split(":")
         return getattr(import_module(module), name)
 
     def __contains__(self, key: object) -> bool:
@@ -40,16 +36,6 @@ class Registry(Mapping[str, Any]):
     def add(self, key: str, where: str) -> None:
         """Add a member at run time, for trying one out: `where` is ``"module:Class"``."""
         self._members[key] = where
-
-    @contextmanager
-    def trying(self, key: str, member: type) -> Iterator[None]:
-        """In the context `key` gives this class, which need not be in a module that can be imported."""
-        before = dict(self._members)
-        self._members[key] = member
-        try:
-            yield
-        finally:
-            self._members = before
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._members)

@@ -2,8 +2,7 @@
 
 In the project the class would be `models/families/nearest_batch.py` and the line
 `"nearest_batch": "models.families.nearest_batch:NearestBatch"` in `models/families/__init__.py`; here both are made on
-the spot. From then on the grid crosses it, the report ranks it and the tests over the registry check it. The same
-checks run on a class that is in no registry: `td.testing.check_family`.
+the spot. From then on the grid crosses it, the report ranks it and `pytest tests/contracts -k nearest_batch` checks it.
 """
 
 from collections.abc import Sequence
@@ -57,9 +56,7 @@ if __name__ == "__main__":
     from models.selection.crossing import Plan
     from models.selection.grid import run_grid
     from plants.sample.sample_year import write_sample_year
-    from thermodrift.testing import check_family
 
-    check_family(NearestBatch)  # a failed check says what was expected, what came and why it matters
     FAMILIES.add("nearest_batch", f"{__name__}:NearestBatch")
 
     machine = load_machine(Path(__file__).parent.parent / "machines" / "sample_vmc.yml")

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 __all__ = [
     "FAMILIES", "MECHANISMS", "SELECTORS", "CalibrationOptions", "Lake", "Plan", "__version__", "calibrate", "cross",
     "diagnose", "export", "ingest", "leaderboard", "load_machine", "load_model", "predict", "read", "registry",
-    "rehearse", "sample_year", "save_model", "simulate", "testing", "train",
+    "rehearse", "sample_year", "save_model", "simulate", "train",
 ]  # fmt: skip
 _MODULES = {
     "CalibrationOptions": "twin.calibration", "FAMILIES": "models.families", "Lake": "data.lake",
@@ -72,8 +72,6 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         value: Any = version("thermodrift")
-    elif name == "testing":
-        value = import_module("thermodrift.testing")
     else:
         value = getattr(import_module(_MODULES.get(name, "thermodrift.api")), name)
     globals()[name] = value

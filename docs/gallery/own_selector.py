@@ -1,7 +1,7 @@
-"""How is a selector of one's own written, checked and compared?
+"""How is a selector of one's own written and compared?
 
-One class: the sensors that correlate best with the error, without those that nearly repeat one in front. The contract
-suite runs it on data with known answers; then it competes with plain correlation on later runs.
+One class: the sensors that correlate best with the error, without those that nearly repeat one in front. It competes
+with plain correlation on later runs.
 """
 
 import tempfile
@@ -29,7 +29,6 @@ class Distinct(Selector):
         return {n: in_order(design, [*distinct, *behind][:n]) for n in n_tsps}
 
 
-checks = list(td.testing.check_selector(Distinct))  # a promise that is not kept raises an error that says which
 with tempfile.TemporaryDirectory() as folder:
     machine, files = td.sample_year(folder, seed=0)
     batches = td.read(files, machine)
@@ -44,8 +43,7 @@ def S_um(selector):
 
 own, other = Distinct(), td.SELECTORS["correlation"]()
 own_um, other_um = S_um(own), S_um(other)
-print(f"{len(checks)} checks kept; S: own {np.mean(own_um):.2f} µm, plain correlation {np.mean(other_um):.2f} µm")
-assert len(checks) >= 10
+print(f"S: own {np.mean(own_um):.2f} µm, plain correlation {np.mean(other_um):.2f} µm")
 assert np.mean(own_um) < 0.8 * np.mean(other_um)
 
 labels = {"ylabel": "S of the z error, µm", "ylim": (0, 9)}

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import csv
 import io
-import itertools
 import json
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from compensation.connectors import SINKS, SOURCES, open_sink, open_source
+from compensation.connectors import open_sink, open_source
 from compensation.connectors.messages import Inbox, overall_state
 from compensation.connectors.streams import CsvSink, CsvSource, StandardInput, StandardOutput
 from compensation.contracts import Correction, Sample, Source
 from data.errors import InputError, WorkError
 from data.machine import Machine, parse_machine
-from thermodrift.testing import ContractCheck, check_sink, check_source
 
 TIMEOUT_S = 30.0
 MACHINE = """
@@ -341,61 +337,7 @@ def test_a_cut_last_row_is_ended_and_another_table_is_refused(machine: Machine, 
         CsvSink(str(tmp_path / "nowhere" / "out.csv"), machine)
 
 
-# ----- the contract
-
-
-def standard_input(machine: Machine, samples: Sequence[Sample]) -> Source:
-    lines = [json.dumps({"time_s": s.time_s, **s.values, **s.readings_um}) for s in samples]
-    return StandardInput("-", machine, io.BytesIO("\n".join(lines).encode()))
-
-
-def csv_source(machine: Machine, samples: Sequence[Sample]) -> Source:
-    names = ("front", "spindle_rpm", "z")
-    rows = [(s.time_s, *({**s.values, **s.readings_um}.get(n, "") for n in names)) for s in samples]
-    path = Path("in.csv")
-    path.write_text("".join(",".join(map(str, row)) + "\n" for row in [("time_s", *names), *rows]))
-    return CsvSource(str(path), machine)
-
-
-def standard_output(machine: Machine) -> tuple[StandardOutput, Callable[[], list[dict[str, Any]]]]:
-    stream = io.StringIO()
-    return StandardOutput("-", machine, stream), lambda: [json.loads(line) for line in stream.getvalue().splitlines()]
-
-
-def csv_sink(machine: Machine) -> tuple[CsvSink, Callable[[], list[dict[str, Any]]]]:
-    path = Path("out.csv")
-    fields = {"offset_um": "offset_um", "slope_um_per_m": "slope_um_per_m", "state": "state", "reason": "reasons"}
-
-    def received() -> list[dict[str, Any]]:
-        out = []
-        for row in csv.DictReader(path.read_text().splitlines()):
-            record: dict[str, Any] = {"time_s": float(row["time_s"]), **{name: {} for name in fields.values()}}
-            for axis, (column, name) in itertools.product(("z", "ey"), fields.items()):
-                if cell := row.get(f"{axis}_{column}"):
-                    record[name][axis] = float(cell) if "_um" in name else cell
-            out.append(record)
-        return out
-
-    return CsvSink(str(path), machine), received
-
-
-CONTRACT = [c for make in (standard_input, csv_source) for c in check_source(make, generate_only=True)]
-CONTRACT += [c for make in (standard_output, csv_sink) for c in check_sink(make, generate_only=True)]
-
-
-@pytest.mark.parametrize("check", CONTRACT, ids=str)
-def test_contract(check: ContractCheck, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    check()
-
-
 # ----- addresses and what all share
-
-
-@pytest.mark.parametrize("registry", [SOURCES, SINKS], ids=["sources", "sinks"])
-def test_every_connector_loads_and_has_the_contract(registry: dict[str, type]) -> None:
-    method = "samples" if registry is SOURCES else "write"
-    assert all(callable(getattr(registry[key], method)) and callable(registry[key].close) for key in registry)
 
 
 def test_an_unknown_address_names_the_closest_and_the_allowed(machine: Machine, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from test_exports_programs import PROGRAMS, Batches, dynamic, every_operation, f
 from compensation.exports import EXPORTS
 from compensation.exports.base import AxisModel, Export
 from models.program import replay
-from thermodrift.testing.exports import LIMITS, export_of, offset_only, straight
+from tests.toys.exported import LIMITS, export_of, offset_only, straight
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc to compile the C export")
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")

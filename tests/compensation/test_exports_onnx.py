@@ -12,7 +12,7 @@ from test_exports_programs import PROGRAMS, Batches, dynamic, every_operation, f
 from compensation.exports import EXPORTS
 from compensation.exports.base import AxisModel
 from models.program import Program, replay
-from thermodrift.testing.exports import LIMITS, export_of
+from tests.toys.exported import LIMITS, export_of
 
 onnxruntime = pytest.importorskip("onnxruntime")
 

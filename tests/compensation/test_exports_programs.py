@@ -17,8 +17,7 @@ from data.batch import Batch, Channel
 from data.errors import InputError
 from models.families import FAMILIES
 from models.program import Builder, Program, replay
-from thermodrift.testing import ContractCheck, check_export
-from thermodrift.testing.exports import LIMITS, export_of, offset_only, straight
+from tests.toys.exported import LIMITS, export_of, offset_only, straight
 
 PROGRAMS = tuple(k for k, f in FAMILIES.items() if f.has_program())
 Batches = Callable[..., list[Batch]]
@@ -99,11 +98,6 @@ def rows_with_holes(program: Program, n: int = 60) -> np.ndarray:
 
 def dynamic(axis: str = "z") -> AxisModel:
     return AxisModel(axis, every_operation(), {"a": (5.0, 35.0), "y": (0.0, 500.0)}, LIMITS)
-
-
-@pytest.mark.parametrize("check", [c for key in EXPORTS for c in check_export(key, generate_only=True)], ids=str)
-def test_contract(check: ContractCheck) -> None:
-    check()
 
 
 def test_axes_of_different_steps_cannot_share_a_function(tmp_path: Path) -> None:

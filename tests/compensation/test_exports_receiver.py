@@ -26,7 +26,7 @@ from features.rises import feature
 from models.program import Builder, replay
 from models.selection.conformal import RunBound
 from tests.conftest import make_toy_batches
-from thermodrift.testing.exports import export_of, offset_only, straight
+from tests.toys.exported import export_of, offset_only, straight
 
 LIMITS = Limits(max_offset_um=40.0, rate_um_per_s=0.5, step_um=2.0, hold_s=60.0, stale_s=900.0, warm_up_s=20.0)
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2", "-fsanitize=undefined", "-fno-sanitize-recover")

@@ -18,7 +18,7 @@ from compensation.exports.base import AxisModel
 from compensation.exports.structured_text import StructuredTextExport, real
 from data.errors import InputError
 from models.program import replay
-from thermodrift.testing.exports import LIMITS, export_of, offset_only, straight
+from tests.toys.exported import LIMITS, export_of, offset_only, straight
 
 WORDS = {
     "IF", "THEN", "ELSE", "END_IF", "FOR", "TO", "DO", "END_FOR", "WHILE", "END_WHILE", "AND", "OR", "NOT", "TRUE",

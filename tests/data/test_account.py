@@ -10,7 +10,7 @@ from data.account import Account
 from data.batch import Batch
 from data.checks import check_machine, checked
 from data.machine import Overrule
-from thermodrift.testing.recordings import STEP_S, toy_batch, toy_machine
+from tests.toys.recordings import STEP_S, toy_batch, toy_machine
 
 
 def jumped(row: int = 30) -> Batch:

@@ -11,8 +11,8 @@ import pytest
 from data.batch import Batch, Finding
 from data.checks import check_batch
 from data.machine import parse_machine
-from thermodrift.testing import recordings
-from thermodrift.testing.recordings import AIR, GAIN_K, TAU_S, THERMAL
+from tests.toys import recordings
+from tests.toys.recordings import AIR, GAIN_K, TAU_S, THERMAL
 
 MACHINE = parse_machine(
     recordings.MACHINE.replace("step_s: 300", "step_s: 0.1").replace("resolution: 0.1", "resolution: 0.01"), "toy"

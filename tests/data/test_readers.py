@@ -19,7 +19,6 @@ from data.readers import READERS, reader_for
 from data.readers.cells import parse_number, stamp_formats
 from data.readers.csv import CsvSheet
 from data.recording import read_batches
-from thermodrift.testing import check_reader
 
 SAFE = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 NAMES = {  # what a logger of that encoding may write
@@ -280,21 +279,6 @@ def test_parquet_kinds_of_columns(tmp_path):
     assert batch.values("front").tolist() == list(range(20))  # row 4 is interpolated over 20 s
     assert batch.values("z").tolist() == [i + 0.5 for i in range(20)]
     assert batch.start == pd.Timestamp("2024-05-01 00:00:00")  # as the wall clock shows it
-
-
-LVM = "LabVIEW Measurement\t\nDecimal_Separator\t.\n***End_of_Header***\t\n"
-WRITERS = {
-    "csv": lambda table, path: table.to_csv(path, index=False),
-    "xlsx": lambda table, path: table.to_excel(path, index=False),
-    "parquet": lambda table, path: table.to_parquet(path),
-    "lvm": lambda table, path: path.write_text(LVM + table.to_csv(sep="\t", index=False)),
-}
-CONTRACT = [c for key in READERS for c in check_reader(key, WRITERS[key], generate_only=True)]
-
-
-@pytest.mark.parametrize("check", CONTRACT, ids=str)
-def test_contract(check):
-    check()
 
 
 def test_unknown_suffix_lists_the_known_ones():

@@ -4,7 +4,7 @@ import numpy as np
 
 from data.arrays import Array
 from features.design import Design
-from thermodrift.testing.runs import LENGTHS, P, stack, year
+from tests.toys.runs import LENGTHS, P, stack, year
 
 __all__ = ["LENGTHS", "P", "chain", "orthonormal", "stack", "year"]
 

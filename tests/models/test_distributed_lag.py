@@ -21,7 +21,7 @@ from models.families.distributed_lag import (
 )
 from models.families.linear import Task
 from models.numerics.lags import lag_responses
-from thermodrift.testing.runs import stack
+from tests.toys.runs import stack
 
 SIZES = (60, 45, 52, 40, 57)
 

@@ -10,7 +10,7 @@ from sklearn.linear_model import ElasticNet as SkElasticNet
 from features.design import Design
 from models.families.elastic_net import ElasticNet, sparse_coefficients
 from models.families.linear import Blocks
-from thermodrift.testing.runs import stack
+from tests.toys.runs import stack
 
 K, N, P = 6, 40, 6
 FOLDS = [[j for j in range(K) if j != k] for k in range(K)] + [[2], [0, 3], [1, 2, 5]]

@@ -1,4 +1,4 @@
-"""Every registered family keeps the contract (`thermodrift.testing.families`); rules that several families share."""
+"""Rules that several families share."""
 
 from __future__ import annotations
 
@@ -15,16 +15,7 @@ import pytest
 from data.errors import InputError
 from features.design import Design
 from models.families import FAMILIES
-from thermodrift.testing import ContractCheck, check_family, runs
-
-
-@pytest.mark.parametrize("check", [c for key in FAMILIES for c in check_family(key, generate_only=True)], ids=str)
-def test_contract(check: ContractCheck) -> None:
-    check()
-
-
-def test_keys_are_those_of_the_registry() -> None:
-    assert {key: family.key for key, family in FAMILIES.items()} == {key: key for key in FAMILIES}
+from tests.toys import runs
 
 
 @pytest.mark.parametrize(("key", "options", "words"), [
@@ -134,7 +125,7 @@ def test_a_trained_model_predicts_without_the_library_that_it_learned_with(
     (tmp_path / "model").write_text(plain)
     code = (
         "import json, sys; from pathlib import Path; import numpy as np; from models.base import family_from_plain; "
-        "from thermodrift.testing import runs; "
+        "from tests.toys import runs; "
         "array = lambda part: np.array(part['array'], part['dtype']) if 'array' in part else part; "
         "plain = json.loads(Path(sys.argv[1]).read_text(), object_hook=array); "
         "error_um = family_from_plain(plain).predict_design(runs.design(False), [2])[0]; "

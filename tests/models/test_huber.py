@@ -10,7 +10,7 @@ from sklearn.linear_model import HuberRegressor
 from features.design import Design
 from models.families.huber import Huber, settle
 from models.families.mlr import MLR
-from thermodrift.testing.runs import stack
+from tests.toys.runs import stack
 
 K, N, P = 6, 50, 4
 COEF = np.array([2.0, -1.5, 0.8, 3.0])

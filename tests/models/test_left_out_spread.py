@@ -13,7 +13,7 @@ from models.families.linear import mean_square
 from models.families.mlr import MLR
 from models.families.pcr import PCR
 from models.families.ridge import Ridge
-from thermodrift.testing.runs import stack
+from tests.toys.runs import stack
 
 NOISE_UM = 0.5
 FAMILIES_THAT_TELL = ("mlr", "ridge", "transfer_function")

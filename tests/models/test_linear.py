@@ -19,7 +19,7 @@ from models.families.mlr import MLR
 from models.families.pcr import PCR, PCRByLeaveBatchOut
 from models.families.pls import PLS
 from models.families.ridge import Ridge
-from thermodrift.testing.runs import stack
+from tests.toys.runs import stack
 
 LINEAR = [MLR, Ridge, PCR, PCRByLeaveBatchOut, PLS]
 EVERY = [*LINEAR, ElasticNet, Huber]

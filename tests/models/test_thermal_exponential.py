@@ -8,7 +8,7 @@ import pytest
 from features.design import Design
 from models.families.thermal_exponential import ThermalExponential
 from models.numerics.lags import behind
-from thermodrift.testing.runs import stack
+from tests.toys.runs import stack
 
 
 def make_design(speeds, y) -> Design:

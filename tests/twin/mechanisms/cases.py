@@ -1,4 +1,4 @@
-"""Of every mechanism: its equation once more with units that pint checks, see `thermodrift.testing.points.Case`.
+"""Of every mechanism: its equation once more with units that pint checks, see `tests.toys.points.Case`.
 
 The law itself sees bare numbers; both must agree, so a Spec that states the wrong unit, by dimension or by a factor, is
 found out. Constants of empirical laws carry their units too.
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from thermodrift.testing.points import ZERO, Case, U
+from tests.toys.points import ZERO, Case, U
 
 K = U.kelvin
 SIGMA = U.Quantity(5.670374419e-8, "W/m**2/K**4")

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from signatures_heat import HEAT, usual
 
 from data.arrays import Numeric
-from thermodrift.testing.small_machine import network_with
+from tests.toys.small_machine import network_with
 from twin.mechanisms.base import Mechanism, View
 
 TIME_S = np.arange(0.0, 4 * 3600.0, 60.0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from data.arrays import Numeric
-from thermodrift.testing.small_machine import network_with
+from tests.toys.small_machine import network_with
 from twin.mechanisms.base import Mechanism, View
 
 USUAL_RPM = np.array([1000.0, 2000.0, 4000.0, 8000.0])

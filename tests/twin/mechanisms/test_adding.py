@@ -14,7 +14,8 @@ import signatures_heat
 
 from diagnosis.candidates.library import candidates
 from diagnosis.screening.signatures import asleep
-from thermodrift.testing.small_machine import BODIES, machine_with
+from tests.contracts import test_mechanism_contract as contract
+from tests.toys.small_machine import BODIES, machine_with
 from twin.mechanisms import MECHANISMS
 from twin.schema import twin_part
 
@@ -23,23 +24,24 @@ KEY = "wiper_friction"
 
 @pytest.fixture
 def example(monkeypatch: pytest.MonkeyPatch) -> tuple[str, Any]:
-    """The page's text, and its blocks of code: the mechanism, its contract, the test of the project."""
+    """The page's text, and its blocks of code: the mechanism, and what its tests need."""
     text = (Path(__file__).parents[3] / "docs" / "adding_a_mechanism.md").read_text(encoding="utf-8")
-    law, contract, test = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    law, test = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
     module = ModuleType("wipers")
     exec(law, module.__dict__)
     monkeypatch.setitem(sys.modules, "wipers", module)
     monkeypatch.setattr(MECHANISMS, "_members", {**MECHANISMS._members, KEY: "wipers:WiperFriction"})
-    return text, (module, contract, test)
+    return text, (module, test)
 
 
 def test_the_example_keeps_the_contract(example: tuple[str, Any]) -> None:
-    module, contract, test = example[1]
-    exec(contract, dict(module.__dict__))
+    module, test = example[1]
     names = {"CASES": {}, "Case": cases.Case, "heat": signatures_heat.heat, "pytest": pytest}
     exec(test, names)
-    assert names["CASES"][KEY].formula is not None
     names[KEY](module.WiperFriction())
+    given = contract.Given(module.WiperFriction(), names["CASES"][KEY])
+    for check in (function for name, function in vars(contract).items() if name.startswith("test_")):
+        check(given)
 
 
 def test_the_line_in_the_docs_is_how_lines_look(example: tuple[str, Any]) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data.errors import InputError
-from thermodrift.testing.small_machine import machine_with, network_with, part_with
+from tests.toys.small_machine import machine_with, network_with, part_with
 from twin.compile import compile_network, expanded
 from twin.mechanisms.base import View
 from twin.mechanisms.displacement import (

@@ -10,7 +10,7 @@ import pytest
 from data.errors import InputError
 from data.machine import Machine, load_machine
 from diagnosis.candidates.library import candidates
-from thermodrift.testing.small_machine import machine_with
+from tests.toys.small_machine import machine_with
 from twin.compile import compile_network, expanded
 from twin.mechanisms.joints import HeatBridge
 from twin.schema import TwinPart, twin_part

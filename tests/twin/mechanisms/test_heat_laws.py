@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from thermodrift.testing.small_machine import machine_with
+from tests.toys.small_machine import machine_with
 from twin.compile import compile_network
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Mechanism, View

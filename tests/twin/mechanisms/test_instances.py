@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from data.errors import InputError
-from thermodrift.testing.small_machine import network_with
+from tests.toys.small_machine import network_with
 from twin.mechanisms import MECHANISMS
 
 ENDS = {"at": {"body": "first", "other": "third"}}

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from thermodrift.testing.small_machine import network_with
+from tests.toys.small_machine import network_with
 from twin.mechanisms.base import View
 from twin.mechanisms.fluids import CoolantJacket, JacketChiller
 

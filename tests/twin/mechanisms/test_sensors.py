@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermodrift.testing.small_machine import part_with
+from tests.toys.small_machine import part_with
 from twin.compile import expanded
 from twin.mechanisms.base import View
 from twin.mechanisms.sensors import (

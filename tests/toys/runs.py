@@ -1,4 +1,4 @@
-"""Recordings and designs for the suites: a run with a known law, a machine file with a twin, stacked rows of a year."""
+"""Recordings and designs: a run with a known law, a machine file with a twin, stacked rows of a year."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ twin:
 
 @cache
 def machine() -> Machine:
-    return parse_machine(MACHINE, "thermodrift.testing")
+    return parse_machine(MACHINE, "vmc")
 
 
 def make_batch(k: int) -> Batch:

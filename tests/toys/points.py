@@ -28,7 +28,7 @@ Formula = Callable[[SimpleNamespace], Any]
 
 @dataclass(frozen=True)
 class Case:
-    """What a suite needs to know of a mechanism.
+    """What the contract needs to know of a mechanism.
 
     Attributes:
         formula: its equation over quantities with units: `q.area`, `q.speed` in the unit of the Spec or driver,
