@@ -13,7 +13,7 @@ NOTHING = "–"
 _HUGE = 10_000.0
 
 _FAMILIES = {"zero": "no model", "mean_curve": "mean curve", "thermal_exponential": "thermal exponential",
-             "twin": "physics twin",
+             "twin": "physics twin", "hist_gradient_boosting": "gradient boosting",
              "twin_residual": "twin + residual", "twin_kalman": "twin with sensors", "pcr": "PCR 95 %",
              "pcr_lbo": "PCR tuned", "gm1n": "GM(1,N)", "lssvm": "LS-SVM"}  # fmt: skip
 _SELECTORS = {"none": "all sensors", "pca_elimination": "PCA elimination", "fcgc": "FCGC", "fcm_grey": "FCM + grey",

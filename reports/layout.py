@@ -24,7 +24,7 @@ _CLOSEST, _MOST_TICKS = 7.0, 7  # least distance of two ticks, in 0..100
 
 @dataclass(frozen=True)
 class Scale:
-    """A logarithmic axis in µm that all strips of a table share; positions in 0..100."""
+    """A logarithmic axis in µm; positions in 0..100."""
 
     low_um: float
     high_um: float
@@ -69,25 +69,6 @@ class Scale:
 
 
 @dataclass(frozen=True)
-class Strip:
-    """A dot per batch on a table's scale, and their mean; `beyond` counts the dots that leave it."""
-
-    dots: tuple[float, ...]
-    mean: float
-    beyond: int
-    label: str
-
-
-@dataclass(frozen=True)
-class Shade:
-    """A cell of a heat map: its text, a smaller line below, and the share 0..1 of the full colour."""
-
-    text: str
-    below: str
-    share: float
-
-
-@dataclass(frozen=True)
 class Gauge:
     """A small picture of a value in its range, positions in 0..100: a band, marks across it, dots.
 
@@ -123,37 +104,31 @@ class Column:
 
     title: str
     unit: str = ""
-    kind: Literal["text", "number", "strip", "wide", "shade"] = "text"
-    name: str = ""  # what a row's maker calls it; the title where empty
-
-    @property
-    def key(self) -> str:
-        return self.name or self.title
+    kind: Literal["text", "number", "wide"] = "text"
 
 
 @dataclass(frozen=True)
 class Row:
     """A row's cells; `mark` says in a word why it stands out, `look` is a class of the style sheet."""
 
-    cells: tuple[str | Strip | Shade | Cell, ...]
+    cells: tuple[str | Cell, ...]
     mark: str = ""
     look: str = ""
 
     @classmethod
-    def of(cls, *cells: str | Strip | Shade | Cell, mark: str = "", look: str = "") -> Row:
+    def of(cls, *cells: str | Cell, mark: str = "", look: str = "") -> Row:
         """From the cells one by one."""
         return cls(cells, mark, look)
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table with its caption, the strips' scale and notes below."""
+    """A table with its caption and notes below."""
 
     caption: str
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
     simulated: bool = False
-    scale: Scale | None = None
     notes: tuple[str, ...] = ()
     look: str = ""  # stacked: a card per row on a narrow screen
 
@@ -204,7 +179,7 @@ class Plot:
 
     figure: Figure
     title: str
-    size: Literal["full", "half", "third"] = "full"
+    size: Literal["full", "third"] = "full"
 
     @property
     def width_px(self) -> int:

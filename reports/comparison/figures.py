@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,25 +17,12 @@ from numpy.typing import NDArray
 
 from data.arrays import Array
 from data.sweeps import sweep_numbers
-from reports.comparison.tables import LeftOut, is_baseline
+from reports.comparison.tables import LeftOut
 from reports.drawing import GREY, MUTED, panel
-from reports.labels import (
-    BLUE,
-    INK,
-    ORANGE,
-    cell_label,
-    family_label,
-    number,
-    selector_label,
-    styles,
-    tex_escaped,
-)
-from reports.layout import Key, Scale
+from reports.labels import BLUE, INK, ORANGE, family_label, number, selector_label, tex_escaped
+from reports.layout import Scale
 
-THIRD_IN, HALF_IN = 3.35, 5.15  # 360 and 560 px on the page
-MARKS = {"circle": "o", "square": "s", "diamond": "D", "triangle-up": "^"}
-_DASHES = {"dot": ":", "dash": "--", "dashdot": "-."}
-_LEVELS = {"zero": "dot", "mean_curve": "dash"}
+THIRD_IN = 3.35  # 360 px on the page
 _LEFT_IN, _RIGHT_IN = 0.42, 0.08  # room for tick labels
 
 
@@ -53,100 +40,91 @@ def say_simulated(ax: Axes, simulated: bool) -> None:
         ax.set_title("SIMULATED", loc="right", fontsize=7.5, color=ORANGE, fontweight="bold", pad=3)
 
 
-def logarithmic(ax: Axes, scale: Scale, axis: str = "y") -> None:
-    """A logarithmic axis with round ticks, at most as many as it holds."""
-    ticks = [float(label) for _, label in scale.ticks]
+def logarithmic(ax: Axes, scale: Scale, axis: str = "y", apart: float = 0.0) -> None:
+    """A logarithmic axis with round ticks, at least `apart` percent of its length from each other."""
+    ticks: list[float] = []
+    for at, label in scale.ticks:
+        if not ticks or at - scale.at(ticks[-1]) >= apart:
+            ticks.append(float(label))
     ax.set(**{f"{axis}scale": "log", f"{axis}lim": (scale.low_um, scale.high_um)})
     ax.set(**{f"{axis}ticks": ticks, f"{axis}ticklabels": [f"{v:g}" for v in ticks]})
     ax.minorticks_off()
 
 
-def best_cells(best: pd.DataFrame, nothing_um: float, title: str, simulated: bool) -> Figure:
-    """A bar per row, S_mean with S_std; baselines grey.
+_ROW_IN, _NAME_IN, _CELL_IN = 0.17, 1.15, 1.05
+_MOST_ROWS = 12
+
+
+def tried(cells: pd.DataFrame, chosen: str, title: str, levels_um: Mapping[str, float], simulated: bool) -> Figure:
+    """A row per family, least S first, a mark for each of its cells; right of it selector and points of the least.
 
     Args:
-        best: selector, family, n_tsp, S_mean_um, S_std_um, best first.
-        nothing_um: S_mean without a model; the axis ends at twice this.
+        cells: selector, family, n_tsp, S_mean_um of all that were judged on the same runs.
+        chosen: the chosen cell, as ``selector|family|n_tsp``.
+        levels_um: S of the baselines by name, a line each.
     """
-    names = [cell_label(str(r["selector"]), str(r["family"]), int(r["n_tsp"])) for r in best.to_dict("records")]
-    tall_in = 0.26 * len(best)
-    fig = Figure(figsize=(7.0, tall_in + 0.8))
-    ax = panel(fig, 2.8, 0.3, 4.0, tall_in)
-    spread = best["S_std_um"].fillna(0.0)
-    colors = np.where(is_baseline(best), GREY, BLUE)
-    ax.barh(names, best["S_mean_um"], xerr=spread, color=colors, ecolor=INK, error_kw={"lw": 1}, height=0.62)
-    widest = float((best["S_mean_um"] + spread).max())
-    ax.set_xlim(0, 1.05 * (min(widest, 2 * nothing_um) if nothing_um > 0 else widest) or 1.0)
-    ax.set_ylim(len(best) - 0.5, -0.5)
-    ax.set_title(tex_escaped(title), loc="left", fontsize=8, color=MUTED)
-    ax.set_xlabel("S_mean ± S_std, µm", fontsize=8, color=MUTED)
-    say_simulated(ax, simulated)
+    least = cells.sort_values("S_mean_um", kind="stable").drop_duplicates("family")[:_MOST_ROWS]
+    tall_in = _ROW_IN * len(least)
+    fig = Figure(figsize=(THIRD_IN, tall_in + 0.8))
+    ax = panel(fig, _NAME_IN, 0.36, THIRD_IN - _NAME_IN - _CELL_IN, tall_in)
+    labels = cells["selector"] + "|" + cells["family"] + "|" + cells["n_tsp"].astype(str)
+    for i, row in enumerate(least.to_dict("records")):
+        own = cells[cells["family"] == row["family"]]
+        every = own["selector"] == "none"
+        by_selector = own.loc[~every, "S_mean_um"]
+        ax.plot(by_selector, [i] * len(by_selector), "o", color=BLUE, ms=3.6, alpha=0.45, mec="none")
+        ax.plot(own.loc[every, "S_mean_um"], [i] * int(every.sum()), "s", color=INK, ms=3.8)
+        mine = own.loc[labels[own.index] == chosen, "S_mean_um"]
+        ax.plot(mine, [i] * len(mine), "D", color=ORANGE, ms=5.5)
+        ax.text(1.04, i, _chosen_by(row), transform=ax.get_yaxis_transform(), fontsize=7, color=MUTED, va="center")
+    for name, level in levels_um.items():
+        ax.axvline(level, color=MUTED, lw=1.0, ls=LEVELS[name])
+    values = [*cells["S_mean_um"], *levels_um.values()]
+    logarithmic(ax, Scale.over(values, math.inf), "x", apart=18)
+    ax.set_yticks(range(len(least)), [family_label(f) for f in least["family"]], fontsize=7.5)
+    ax.set_ylim(len(least) - 0.4, -0.6)
+    ax.set_xlabel("S_mean, µm", fontsize=8, color=MUTED, labelpad=2)
+    _headed(fig, title, simulated)
     return fig
 
 
-def against_points(
-    lines: pd.DataFrame, flat: pd.DataFrame, column: str, title: str, chosen: str, simulated: bool
-) -> Figure:
-    """One score against the number of points, a line per family at its best selector.
+LEVELS = {"no model": ":", "mean curve": "--"}
+
+
+def _chosen_by(cell: dict[Any, Any]) -> str:
+    """``mRMR, 4``: the selector and the number of its points."""
+    return f"{selector_label(cell['selector'])}, {cell['n_tsp']}" if cell["n_tsp"] else ""
+
+
+def _headed(fig: Figure, title: str, simulated: bool) -> None:
+    """The title in the upper left corner; simulated data are called so in the right one."""
+    y = 1 - 0.14 / fig.get_figheight()
+    fig.text(0.04 / THIRD_IN, y, tex_escaped(title), fontsize=8.5, color=INK, va="center")
+    if simulated:
+        style: Any = {"fontsize": 7.5, "color": ORANGE, "fontweight": "bold", "va": "center", "ha": "right"}
+        fig.text(1 - 0.05 / THIRD_IN, y, "SIMULATED", **style)
+
+
+def in_order(runs: pd.DataFrame, bound_um: float, title: str, simulated: bool) -> Figure:
+    """S of every left-out run in the order of time, with the model and without one, and the bound of any run.
 
     Args:
-        lines: family, selector, n_tsp and `column` in µm.
-        flat: families without inputs: a level each.
-        chosen: the family of the promoted cell, drawn stronger.
+        runs: start, S_um, none_um.
     """
-    fig = Figure(figsize=(HALF_IN, 3.0))
-    ax = axes_in(fig, 0.25, 2.35, title, "number of points n")
-    n_max = int(lines["n_tsp"].max()) if len(lines) else 1
-    for row in flat.to_dict("records"):
-        ax.axhline(row[column], color=MUTED, lw=1.1, ls=_DASHES[flat_dash(row["family"])],
-                   label=family_label(row["family"]))  # fmt: skip
-    looks = styles(lines["family"].tolist())
-    for (family, selector), own in lines.groupby(["family", "selector"], sort=False):
-        own, (color, symbol) = own.sort_values("n_tsp"), looks[str(family)]
-        strong = family == chosen
-        ax.plot(own["n_tsp"], own[column], color=color, marker=MARKS[symbol], lw=2.2 if strong else 1.0,
-                ms=4.5 if strong else 3.2, zorder=3 if strong else 2,
-                label=f"{family_label(str(family))}, {selector_label(str(selector))}")  # fmt: skip
-    ax.set_xlim(0.6, n_max + 0.4)
-    ax.xaxis.set_major_locator(MaxNLocator(12, integer=True, min_n_ticks=1))
-    top = float(flat[column].max()) if len(flat) else math.inf
-    logarithmic(ax, Scale.over([*lines[column], *flat[column]], 1.2 * top))
-    say_simulated(ax, simulated)
-    return fig
-
-
-def flat_dash(family: str) -> str:
-    """The dash of a level."""
-    return _LEVELS.get(family, "dashdot")
-
-
-@dataclass(frozen=True)
-class Cloud:
-    """Points (n,) of one kind, S in µm on both axes."""
-
-    x_um: Array
-    y_um: Array
-    key: Key
-
-
-def S_against_S(
-    clouds: Sequence[Cloud], lines: Sequence[tuple[float, str]], x: str, y: str, simulated: bool, equal: bool = True
-) -> Figure:
-    """A mark per batch on two logarithmic axes, equal ones by default; a line (factor, colour) is y = factor · x."""
-    fig = Figure(figsize=(HALF_IN * 0.8, HALF_IN * 0.8))
-    ax = axes_in(fig, 0.25, HALF_IN * 0.8 - 0.7, f"{y}, µm", f"{x}, µm")
-    values = [np.concatenate([of(c) for c in clouds]) for of in (lambda c: c.x_um, lambda c: c.y_um)]
-    values = [np.concatenate(values)] * 2 if equal else values
-    scales = [Scale.over(v.tolist(), math.inf) for v in values]
-    for axis, scale in zip("xy", scales, strict=True):
-        logarithmic(ax, scale, axis)
-    for c in clouds:
-        at = [np.maximum(v, scale.low_um) for v, scale in zip((c.x_um, c.y_um), scales, strict=True)]
-        ax.plot(*at, color=c.key.color, marker=MARKS[c.key.symbol], ls="", ms=4.5, mec="white", mew=0.4)
-    ends = np.array([scales[0].low_um, scales[0].high_um])
-    for factor, color in lines:
-        ax.plot(ends, factor * ends, color=color, lw=1.3, zorder=1)
-    say_simulated(ax, simulated)
+    fig = Figure(figsize=(THIRD_IN, 2.3))
+    ax = axes_in(fig, 0.36, 1.5, "", "run, in order of time")
+    at = np.arange(len(runs))
+    ax.plot(at, runs["none_um"], "s", color=GREY, ms=4, mec=MUTED, mew=0.5)
+    ax.plot(at, runs["S_um"], "o", color=BLUE, ms=4.5)
+    if math.isfinite(bound_um):
+        ax.axhline(bound_um, color=INK, lw=1.0, ls="--")
+    logarithmic(ax, Scale.over([*runs["none_um"], *(0.85 * runs["S_um"]), 1.1 * bound_um], math.inf))
+    ends = sorted({0, len(runs) - 1})
+    ticks = ax.set_xticks(ends, [str(runs["start"].iloc[k])[:10] for k in ends], fontsize=7, ha="left")
+    if len(ticks) > 1:
+        ticks[-1].label1.set_horizontalalignment("right")
+    ax.set_xlim(-0.9, len(runs) - 0.1)
+    _headed(fig, title, simulated)
     return fig
 
 

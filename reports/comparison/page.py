@@ -1,4 +1,4 @@
-"""The page as data: header, one part per error channel, the findings of the recordings."""
+"""The page as data: a sentence for each error channel, three pictures, one table, the viewer, and one fold."""
 
 from __future__ import annotations
 
@@ -11,88 +11,103 @@ import pandas as pd
 
 from data.errors import InputError, check_suffix
 from data.registry import Registry
+from data.units import unit_label
 from features.selectors import SELECTORS
 from models.families import FAMILIES
 from models.protocols import PromotionRule
 from models.selection.result import GridResult, Training
-from reports.comparison import story as records
-from reports.comparison.channel import channel_part
-from reports.comparison.headline import overview
-from reports.comparison.story import promoted_cell, verdict
-from reports.comparison.tables import group_order, protocols_of, scored
-from reports.labels import count, decimals, family_label, listed, number, selector_label
-from reports.layout import Page, Pairs, Section, Text, given, with_unit
+from reports.comparison import pictures, story, tables
+from reports.comparison.channel import Channel, leaders, sentence
+from reports.labels import count, family_label, listed, number, selector_label
+from reports.layout import Details, Heading, Items, Page, Pairs, Section, Text, given, with_unit
 from reports.rendering import FORMATS, write_page
-
-_FEW_FINDINGS = 12
 
 
 def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
-    """The page. Trainings of one machine and channel are compared; the newest stands for the channel.
+    """The page. Trainings of one machine and channel are compared; the newest stands for the channel, the channel with
+    the largest error first.
 
     Raises:
         InputError: no training, or one without a judged cell.
     """
     if not trainings:
         raise InputError("report: got no training; give at least one tracked training")
-    groups = _grouped(trainings)
     machines = list(dict.fromkeys(t.result.machine for t in trainings))
-    newest = [group[0] for group in groups]
-    names = [_name(t, len(machines) > 1) for t in newest]
-    channels, rows, units = [], [], []
-    for i, (name, group) in enumerate(zip(names, groups, strict=True)):
-        protocol = protocols_of(group[0].result)[0]
-        cells = scored(group[0].result, protocol)
-        if cells.empty:
-            raise InputError(f"report: training {group[0].training_id} has no cell with a finite score; train again")
-        choices = [promoted_cell(t, rule) for t in group]
-        digits = decimals(choices[0].S_std_um, choices[0].n_batches)
-        said = verdict(name, group[0], choices[0])
-        rows.append((name, group[0], choices[0], said, digits))
-        units.append(group[0].params.get("unit", "um"))
-        channels.append(with_unit(channel_part(f"c{i + 1}", name, group, choices, said, rule), units[-1]))
-    common = units[0] if len({*units}) == 1 else "its own unit"
-    results = [t.result for t in newest]
-    simulated = any(t.simulated or t.result.simulated for t in trainings)
-    machine = listed(machines)
-    n_batches = sum(len(set().union(*(r.batches["batch_id"] for r in results if r.machine == m))) for m in machines)
-    first = with_unit(overview(rows, simulated), common) if len(rows) > 1 else None
-    sources = [f"{_name(t, len(machines) > 1)}, {t.started:%Y-%m-%d %H:%M} UTC: {t.training_id}" for t in trainings]
+    mixed = len({_simulated(t) for t in trainings}) > 1
+    channels = [Channel.of(_name(g[0], len(machines) > 1, mixed), g, rule) for g in _grouped(trainings)]
+    channels.sort(key=lambda c: -np.nan_to_num(c.none_um))
+    units = {c.unit for c in channels}
+    unit = unit_label(units.pop()) if len(units) == 1 else "own unit"
+    said = [with_unit(text, c.unit) for c in channels for text in sentence(c)]
+    left_out = pictures.left_out_panels(channels)
+    blocks = given(
+        None if left_out else Text("No left-out prediction of these models was kept.", "soft"),
+        *left_out,
+        leaders(channels, rule, unit),
+        pictures.tried_panel(channels),
+        pictures.time_panel(channels),
+        pictures.runs_viewer(channels),
+        Details("What a laboratory can check", _checks(channels, rule)),
+    )
+    sources = [f"{c.name}, {t.started:%Y-%m-%d %H:%M} UTC: {t.training_id}" for c in channels for t in c.trainings]
     return Page(
         "thermodrift comparison report",
-        f"Thermal error models of {machine}",
-        given(Pairs(_facts(newest, n_batches), "facts compact"), first),
-        (*channels, _findings(list(zip(names, results, strict=True)), n_batches, simulated), _glossary(results, rule)),
+        f"Thermal error models of {listed(machines)}",
+        (*said, Text(_recordings(channels), "note")),
+        (Section("models", "", blocks),),
         (f"From tracked trainings: {'; '.join(sources)}.",),
-        simulated,
+        any(_simulated(t) for t in trainings),
     )
 
 
-def _findings(results: Sequence[tuple[str, GridResult]], n_batches: int, simulated: bool) -> Section:
-    found = records.findings_of([r for _, r in results])
-    left = records.excluded(results, simulated)
-    every = records.findings(found, simulated) if len(found) else None
-    if every is not None and len(found) > _FEW_FINDINGS:
-        shown: tuple[Any, ...] = (records.findings_by_channel(found, simulated), every.folded())
-    else:
-        shown = (every,)
-    none = Text("No channel was excluded and no family failed.")
-    blocks = given(Text(records.findings_summary(found, n_batches)), *shown, left if left.rows else none)
-    return Section("findings", "Data findings", blocks, simulated=simulated)
-
-
-def _glossary(results: Sequence[GridResult], rule: PromotionRule) -> Section:
+def _checks(channels: Sequence[Channel], rule: PromotionRule) -> tuple[Any, ...]:
+    """All that stands in the fold: the channels one by one, the recordings' findings, the terms."""
+    blocks = [b for c in channels for b in with_unit(_channel(c, rule), c.unit)]
+    results = [(c.name, c.result) for c in channels]
+    found = story.findings_of([r for _, r in results])
+    left = story.excluded(results)
     members = (
         ("families", _members(FAMILIES, results, "family", family_label)),
         ("selectors", _members(SELECTORS, results, "selector", selector_label)),
         ("champion, provisional, challenger", f"{_STANDINGS} {_rule_sentence(rule)}"),
     )
-    return Section("glossary", "What the numbers mean", (Pairs((*GLOSSARY, *members), "glossary"),))
+    return given(
+        *blocks,
+        Heading("Findings in the recordings"),
+        Text(story.findings_summary(found, _n_batches(channels))),
+        story.findings(found) if len(found) else None,
+        left if left.rows else Text("No channel was excluded and no family failed."),
+        Heading("What the numbers mean"),
+        Pairs((*GLOSSARY, *members), "glossary"),
+    )
 
 
-def _members(registry: Registry, results: Sequence[GridResult], column: str, label: Callable[[str], str]) -> str:
+def _channel(c: Channel, rule: PromotionRule) -> tuple[Any, ...]:
+    """What stands behind one channel's row."""
+    result, choice, digits = c.result, c.choice, c.digits
+    inside = story.certainty(result, choice)
+    facts = [("points", ", ".join(choice.inputs)), ("inside the stated 90 % interval", inside)]
+    facts += [("weakness of the selector", text) for text in story.weaknesses(result, choice)]
+    facts += story.comparison_rows(c.trainings[0].promotion)
+    return given(
+        Heading(c.name, (c.verdict.chip, c.verdict.outcome)),
+        Text(c.verdict.summary),
+        Pairs(tuple((k, v) for k, v in facts if v), "pairs"),
+        Items(tuple(story.changes(c.trainings, c.choices, rule))),
+        story.trainings(c.name, c.trainings, c.choices) if len(c.trainings) > 1 else None,
+        tables.groups(c.name, result, choice, c.expected.protocol, digits),
+        tables.families(c.name, result, choice, digits, c.mark),
+        tables.bounds(c.name, result.distances, digits),
+        tables.readings(c.name, result, digits),
+        tables.batches(c.name, result, choice, digits),
+    )
+
+
+def _members(
+    registry: Registry, results: Sequence[tuple[str, GridResult]], column: str, label: Callable[[str], str]
+) -> str:
     """Label and summary of every member that was tried, in the registry's order."""
-    tried = set().union(*(r.cells[column] for r in results))
+    tried = set().union(*(r.cells[column] for _, r in results))
     said = [f"{label(k)} ({registry[k].summary.removeprefix(f'{label(k)}: ')})" for k in registry if k in tried]
     return f"{'; '.join(said)}."
 
@@ -105,28 +120,40 @@ def _grouped(trainings: Sequence[Training]) -> list[list[Training]]:
     return [sorted(g, key=lambda t: t.started, reverse=True) for g in groups.values()]
 
 
-def _name(training: Training, several: bool) -> str:
-    return f"{training.result.machine} {training.result.target}" if several else training.result.target
+def _name(training: Training, several: bool, mixed: bool) -> str:
+    """The channel, with its machine where there are several; SIMULATED where that is not so of the whole page."""
+    name = f"{training.result.machine} {training.result.target}" if several else training.result.target
+    return f"{name} (SIMULATED)" if mixed and _simulated(training) else name
 
 
-def _facts(newest: Sequence[Training], n_batches: int) -> tuple[tuple[str, str], ...]:
-    batches = pd.concat([t.result.batches for t in newest], ignore_index=True)
+def _simulated(training: Training) -> bool:
+    return training.simulated or training.result.simulated
+
+
+def _n_batches(channels: Sequence[Channel]) -> int:
+    ids = {(c.result.machine, b) for c in channels for b in c.result.batches["batch_id"]}
+    return len(ids)
+
+
+def _recordings(channels: Sequence[Channel]) -> str:
+    """How much was recorded when, at which start ambient and speeds, and when it was learned."""
+    batches = pd.concat([c.result.batches for c in channels], ignore_index=True)
     once = batches.drop_duplicates(["batch_id", "digest"])
     read, dropped = (int(once[c].sum()) if c in once else 0 for c in ("rows_read", "rows_dropped"))
     starts = sorted(str(s)[:10] for s in batches.get("start", pd.Series(dtype=str)).dropna() if str(s))
     span = f", {starts[0]} to {starts[-1]}" if starts else ""
     ambient = batches.get("start_ambient_degC", pd.Series(dtype=float)).to_numpy(float)
     ambient = ambient[np.isfinite(ambient)]
-    speeds = sorted(set(batches.get("speed", pd.Series(dtype=str)).astype(str)), key=group_order)
-    trained = sorted(f"{t.started:%Y-%m-%d %H:%M}" for t in newest)
-    facts = [
-        ("Recordings", f"{count(n_batches, 'batch')}{span}"),
-        ("Rows", f"{read} read, {dropped} dropped" if read else ""),
-        ("Start ambient", f"{number(ambient.min())} to {number(ambient.max())} °C" if len(ambient) else ""),
-        ("Spindle", listed([s for s in speeds if s != "unknown"])),
-        ("Trained", trained[0] + (f" to {trained[-1]}" if trained[-1] != trained[0] else "") + " UTC"),
+    speeds = sorted(set(batches.get("speed", pd.Series(dtype=str)).astype(str)), key=tables.group_order)
+    trained = sorted(f"{c.trainings[0].started:%Y-%m-%d %H:%M}" for c in channels)
+    said = [
+        f"{count(_n_batches(channels), 'batch')}{span}",
+        f"{read} rows read, {dropped} dropped" if read else "",
+        f"start ambient {number(ambient.min())} to {number(ambient.max())} °C" if len(ambient) else "",
+        listed([s for s in speeds if s != "unknown"]),
+        f"trained {trained[0]}" + (f" to {trained[-1]}" if trained[-1] != trained[0] else "") + " UTC",
     ]
-    return tuple((k, v) for k, v in facts if v)
+    return f"{'; '.join(s for s in said if s)}."
 
 
 def _rule_sentence(r: PromotionRule) -> str:

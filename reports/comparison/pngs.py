@@ -1,43 +1,34 @@
-"""The report's figures of one result as small pictures for the tracking store."""
+"""The report's pictures of one result as small PNGs for the tracking store."""
 
 from __future__ import annotations
 
 import threading
 
+import pandas as pd
+
 from models.protocols import PromotionRule
-from models.selection.promotion import choose
-from models.selection.result import GridResult
-from reports.comparison import figures
-from reports.comparison.tables import best_per, left_out_batches, paths, protocols_of, scored, zero_um
+from models.selection.result import GridResult, Training
+from reports.comparison.channel import Channel
+from reports.comparison.pictures import left_out_panels, time_panel, tried_panel
+from reports.comparison.tables import protocols_of, scored
 from reports.drawing import picture_bytes
 
 _DRAWING = threading.Lock()  # matplotlib's font and text caches are shared by all figures
 _DPI = 90
-_MOST_LINES = 8
 
 
 def figure_pngs(result: GridResult) -> dict[str, bytes]:
-    """File name -> PNG: the families' best cells, accuracy against the number of points, left-out predictions.
+    """File name -> PNG: the median and the worst left-out run, all that was tried, left-out runs in the order of time.
 
     Threads may call it at once. Empty where no cell has a score.
     """
     rule = PromotionRule()
-    protocol = protocols_of(result)[0]
-    cells = scored(result, protocol)
-    if cells.empty:
+    if scored(result, protocols_of(result)[0]).empty:
         return {}
-    choice = choose(result, rule.only(protocol))
-    title, simulated = f"{result.machine} {result.target}, {protocol}", result.simulated
-    best, shown = best_per(cells, "family"), [b for b in left_out_batches(result, choice) if b.place]
-    tried = paths(cells)
-    lines = best_per(tried, "family").head(_MOST_LINES)[["family", "selector"]].merge(tried)
+    training = Training("", pd.Timestamp.now("UTC"), result.simulated, result)
     with _DRAWING:
-        points = figures.against_points(
-            lines, best[best["n_tsp"] == 0], "S_mean_um", f"{title}: S_mean, µm", choice.family, simulated
-        )
-        points.axes[0].legend(fontsize=6, framealpha=0.85, edgecolor="none", ncols=2)
-        drawn = {"families": figures.best_cells(best, zero_um(cells), title, simulated), "points": points}
-        if shown:
-            draw = figures.curves if shown[0].position_mm is None else figures.fan
-            drawn["left_out"] = draw(shown, shown, result.target, 1, simulated)
-        return {f"{name}.png": picture_bytes(figure, "png", _DPI) for name, figure in drawn.items()}
+        own = [Channel.of(f"{result.machine} {result.target}", [training], rule)]
+        left_out = [plot for panel in left_out_panels(own) for plot in panel.plots]
+        plots = dict(zip(("left_out_median", "left_out_worst"), left_out, strict=False))
+        plots |= {n: p.plots[0] for n, p in (("families", tried_panel(own)), ("in_time", time_panel(own))) if p.plots}
+        return {f"{name}.png": picture_bytes(plot.figure, "png", _DPI) for name, plot in plots.items()}

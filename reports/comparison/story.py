@@ -13,10 +13,10 @@ import pandas as pd
 
 from data.errors import InputError
 from models.protocols import PromotionRule
-from models.selection.promotion import Choice, choose, decide, pick
+from models.selection.promotion import Choice, choose, compare_paired, decide, left_out, pick
 from models.selection.result import GridResult, Training
-from reports.comparison.tables import protocols_of
-from reports.labels import between, cell_label, count, decimals, family_label, number, p_label, plus_minus
+from reports.comparison.tables import MAIN_PROTOCOL, protocols_of, scores_of
+from reports.labels import between, cell_label, count, decimals, family_label, listed, number, p_label, plus_minus
 from reports.layout import Column, Row, Table
 
 _FINDING_KEYS = ["batch_id", "check", "channel", "start_s", "end_s", "words", "masks", "overruled"]
@@ -45,7 +45,7 @@ def findings_summary(found: pd.DataFrame, n_batches: int) -> str:
     return summary + (f", {int(overruled.sum())} overruled by the machine file" if overruled.any() else "") + "."
 
 
-def findings(found: pd.DataFrame, simulated: bool) -> Table:
+def findings(found: pd.DataFrame) -> Table:
     """Every finding: where, when, what, and whether it was masked."""
     rows = [
         Row.of(
@@ -66,36 +66,10 @@ def findings(found: pd.DataFrame, simulated: bool) -> Table:
         Column("what was found", "", "wide"),
         Column("for training"),
     )
-    return Table("Every finding", columns, tuple(rows), simulated)
+    return Table("Every finding", columns, tuple(rows))
 
 
-def findings_by_channel(found: pd.DataFrame, simulated: bool) -> Table:
-    """The findings counted per check and channel."""
-    table = found.assign(
-        channel=found["channel"].map(lambda c: _text(c) or "all channels"),
-        overruled=found["overruled"].map(_text).astype(bool),
-    )
-    table["masked"] = table["masks"].map(_yes) & ~table["overruled"]
-    rows = []
-    for (check, channel), part in table.groupby(["check", "channel"], sort=True):
-        rows.append(
-            Row.of(
-                str(check).replace("_", " "), str(channel), str(len(part)), str(part["batch_id"].nunique()),
-                str(int(part["masked"].sum())), str(int(part["overruled"].sum())),
-            )
-        )  # fmt: skip
-    columns = (
-        Column("check"),
-        Column("channel"),
-        Column("findings", "", "number"),
-        Column("batches", "", "number"),
-        Column("masked", "", "number"),
-        Column("overruled", "", "number"),
-    )
-    return Table("Findings per check and channel", columns, tuple(rows), simulated)
-
-
-def excluded(results: Sequence[tuple[str, GridResult]], simulated: bool) -> Table:
+def excluded(results: Sequence[tuple[str, GridResult]]) -> Table:
     """Channels that no cell may use, batches and folds left out, families that failed, with the error channels."""
     of: dict[tuple[str, str], list[str]] = {}
     for name, result in results:
@@ -108,14 +82,14 @@ def excluded(results: Sequence[tuple[str, GridResult]], simulated: bool) -> Tabl
         for (what, why), targets in of.items()
     ]
     columns = (Column("what"), Column("why", "", "wide"), Column("error channel"))
-    return Table("Left out: channels, folds and failed families", columns, tuple(rows), simulated)
+    return Table("Left out: channels, folds and failed families", columns, tuple(rows))
 
 
-def trainings(rows: Sequence[tuple[Training, Choice, int]]) -> Table:
+def trainings(name: str, group: Sequence[Training], choices: Sequence[Choice]) -> Table:
     """The trainings of one channel, newest first."""
     out = []
-    for i, (t, choice, digits) in enumerate(rows):
-        earlier = rows[i + 1][0].result.batches if i + 1 < len(rows) else None
+    for i, (t, choice) in enumerate(zip(group, choices, strict=True)):
+        earlier = group[i + 1].result.batches if i + 1 < len(group) else None
         new, gone = changed_batches(t.result.batches, earlier) if earlier is not None else ([], [])
         p = t.promotion
         out.append(
@@ -124,7 +98,7 @@ def trainings(rows: Sequence[tuple[Training, Choice, int]]) -> Table:
                 str(len(t.result.batches)),
                 f"+{len(new)}" + (f" −{len(gone)}" if gone else "") if earlier is not None else "–",
                 cell_label(choice.selector, choice.family, choice.n_tsp),
-                plus_minus(choice.S_mean_um, choice.S_std_um, digits),
+                plus_minus(choice.S_mean_um, choice.S_std_um, decimals(choice.S_std_um, choice.n_batches)),
                 f"{p['outcome']} (version {p['version']})" if p else "not promoted",
             )
         )
@@ -136,8 +110,33 @@ def trainings(rows: Sequence[tuple[Training, Choice, int]]) -> Table:
         Column("S_mean ± S_std", "µm", "number"),
         Column("outcome"),
     )
-    caption = "The trainings, each judged on its own batches"
-    return Table(caption, columns, tuple(out), rows[0][0].simulated)
+    caption = f"{name}: the trainings, each judged on its own batches"
+    return Table(caption, columns, tuple(out))
+
+
+def changes(group: Sequence[Training], choices: Sequence[Choice], rule: PromotionRule) -> list[str]:
+    """What the newest training has that the one before it had not, and both on the batches they share."""
+    if len(group) < 2:
+        return []
+    now, before = group[0].result, group[1].result
+    new, gone = changed_batches(now.batches, before.batches)
+    said = [f"New since {group[1].started:%Y-%m-%d %H:%M} UTC: {listed(new)}." if new else "No new batch."]
+    if gone:
+        said.append(f"No longer in the training: {listed(gone)}.")
+    run = [set(r.cells["protocol"]) for r in (now, before)]
+    shared = [p for p in (MAIN_PROTOCOL, *rule.protocols) if p in run[0] & run[1]]
+    if not shared:
+        return [*said, "The trainings were judged by different protocols and are not compared."]
+    rule = rule.only(shared[0]).model_copy(update={"min_batches": 2})
+    a, b = (left_out(r, rule, c.selector, c.family, c.n_tsp) for r, c in zip((now, before), choices[:2], strict=True))
+    paired = compare_paired(a, b, rule)
+    if paired.n_batches < 2:
+        return [*said, f"{count(paired.n_batches, 'batch')} in common: nothing to compare."]
+    return [
+        *said,
+        f"On the {count(paired.n_batches, 'batch')} that both know the newest model is "
+        f"{interval_label(paired.as_dict())} on average, better on {paired.n_better}.",
+    ]
 
 
 def changed_batches(now: pd.DataFrame, earlier: pd.DataFrame) -> tuple[list[str], list[str]]:
@@ -328,3 +327,47 @@ def _score(choice: Choice, digits: int) -> str:
         return f"{own} µm on left-out batches ({under})"
     nested = plus_minus(choice.nested_S_mean_um, choice.nested_S_std_um, digits)
     return f"{nested} µm where the other batches choose the model of each ({under}); {own} µm for the model itself"
+
+
+_MEANT, _TOLERATED = 0.90, 0.05
+_BEYOND_CHANCE = 1.6449  # standard errors of a mean over batches
+
+
+def certainty(result: GridResult, choice: Choice) -> str:
+    """How many samples of left-out batches lie inside the model's own 90 % interval; empty where it states none."""
+    scores = scores_of(result, choice.selector, choice.family, choice.n_tsp)
+    if "coverage90" not in scores or not np.isfinite(scores["coverage90"]).any():
+        return ""
+    by = {p: own["coverage90"].dropna().to_numpy(float) for p, own in scores.groupby("protocol")}
+    inside = by.get(choice.protocol, np.array([]))
+    mean, spread = (float(f(inside)) if len(inside) > 1 else math.nan for f in (np.mean, lambda v: np.std(v, ddof=1)))
+    seasons = by.get("leave-season-out", np.array([])) if choice.protocol != "leave-season-out" else np.array([])
+    season = float(seasons.mean()) if len(seasons) else math.nan
+    said = f"{plus_minus(100 * mean, 100 * spread, 0)} % ({choice.protocol}, mean ± std of batches)"
+    said += f", {100 * season:.0f} % where whole seasons are left out" if math.isfinite(season) else ""
+    return f"{said}: {certainty_verdict(mean, spread, len(inside), season)}"
+
+
+def certainty_verdict(mean: float, spread: float, n_batches: int, season: float = math.nan) -> str:
+    """A verdict on a mean share inside the 90 % interval, with its spread over batches.
+
+    Within five per cent of nine tenths it is calibrated; beyond that "perhaps", unless the mean lies further off than
+    chance would put it (one-sided 95 % of a mean over batches). `season`: the share where whole seasons are left out.
+    """
+    if not math.isfinite(mean):
+        return number(mean)
+    if abs(mean - _MEANT) <= _TOLERATED:
+        return "calibrated, but too sure of a new season" if season < _MEANT - _TOLERATED else "calibrated"
+    label = "too sure" if mean < _MEANT else "too careful"
+    if math.isfinite(spread) and abs(mean - _MEANT) > _BEYOND_CHANCE * spread / math.sqrt(n_batches):
+        return label
+    return f"perhaps {label}"
+
+
+def weaknesses(result: GridResult, choice: Choice) -> list[str]:
+    """The known weaknesses of the chosen selector that its choice shows."""
+    found = result.selector_diagnostics
+    if found.empty:
+        return []
+    own = found[(found["selector"] == choice.selector) & ~found["ok"].astype(bool)]
+    return [f"{r['statistic']} {number(r['value'], 2)}: {r['comment']}" for r in own.to_dict("records")]

@@ -1,22 +1,23 @@
-"""Extracts of a training's result, and tables of scores: leaderboards, one per protocol, batches."""
+"""Extracts of a training's result, and the tables that a laboratory checks: families, groups, bounds, batches."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
 from data.arrays import Array
-from features.stability import tsp_frequency
 from models.protocols import PROTOCOLS
-from models.selection.promotion import BASELINES, Choice
-from models.selection.result import CELL_KEYS, GridResult
-from reports.labels import NOTHING, cell_label, count, family_label, listed, number, percent, selector_label
-from reports.layout import Column, Row, Scale, Shade, Strip, Table
+from models.selection.conformal import RunBound
+from models.selection.promotion import BASELINES, KEYS, Choice
+from models.selection.result import GridResult
+from models.selection.trust import SLACK
+from models.selection.updating import COUNTS
+from reports.labels import NOTHING, cell_label, count, number, percent, plus_minus
+from reports.layout import Column, Row, Table
 
 MAIN_PROTOCOL = "leave-batch-out"
 _MOST_POINTS = 400
@@ -31,23 +32,13 @@ class LeftOut:
 
     protocol: str
     batch_id: str
-    place: str  # best, median, worst; "" for all others
+    place: str  # median, worst; "" for all others
     S_um: float
     time_h: Array
     recorded_um: Array
     predicted_um: Array
     every: int  # every how many samples are shown
     position_mm: Array | None = None
-
-
-@dataclass(frozen=True)
-class Frequency:
-    """How often a selector's folds chose each point, 0..1, at its best number of points short of all."""
-
-    selector: str
-    n_tsp: int
-    stability: float
-    share: dict[str, float]
 
 
 def protocols_of(result: GridResult) -> list[str]:
@@ -68,13 +59,6 @@ def best_per(cells: pd.DataFrame, *keys: str) -> pd.DataFrame:
     return cells.drop_duplicates(list(keys)).reset_index(drop=True)
 
 
-def paths(cells: pd.DataFrame) -> pd.DataFrame:
-    """Rows of the selectors that were tried with several numbers of points; all with inputs where none was."""
-    with_inputs = cells[cells["n_tsp"] > 0]
-    several = with_inputs.groupby(["family", "selector"])["n_tsp"].transform("nunique") > 1
-    return with_inputs[several] if several.any() else with_inputs
-
-
 def is_baseline(cells: pd.DataFrame) -> pd.Series:
     """Rows of the families that every table must hold."""
     return cells["family"].isin(BASELINES)
@@ -86,34 +70,8 @@ def zero_um(cells: pd.DataFrame) -> float:
     return float(zero.iloc[0]) if len(zero) else float("nan")
 
 
-def S_by_batch(result: GridResult, cells: pd.DataFrame) -> list[pd.DataFrame]:
-    """Per row of `cells` its scores per fold and batch."""
-    wanted = cells[CELL_KEYS].assign(row=range(len(cells)))
-    rows = result.scores.merge(wanted, on=CELL_KEYS)
-    groups = dict(list(rows.groupby("row")))
-    return [groups.get(i, rows.iloc[:0]) for i in range(len(cells))]
-
-
-def frequencies(result: GridResult, cells: pd.DataFrame, protocol: str) -> list[Frequency]:
-    """Per selector that chooses, at the number of points of its best cell: how often each point was chosen.
-
-    Where all points are taken there is no choice, so the best cell with fewer represents it.
-    """
-    out = []
-    with_inputs = cells[(cells["n_tsp"] > 0) & ~is_baseline(cells)]
-    fewer = with_inputs[with_inputs["n_inputs"] < with_inputs["n_inputs"].max()]
-    for row in best_per(fewer if len(fewer) else with_inputs, "selector").to_dict("records"):
-        s = result.subsets
-        picks = s[(s["protocol"] == protocol) & (s["selector"] == row["selector"]) & (s["n_tsp"] == row["n_tsp"])]
-        sets = [tuple(i for i in str(v).split("|") if i) for v in picks["inputs"]]
-        if row["selector"] != "none" and sets:
-            share = tsp_frequency(sets)
-            out.append(Frequency(row["selector"], int(row["n_tsp"]), float(row["tsp_stability"]), share))
-    return out
-
-
 def left_out_batches(result: GridResult, choice: Choice) -> list[LeftOut]:
-    """Every left-out batch of a cell by S, the best, median and worst by name; empty where no prediction was kept.
+    """Every left-out batch of a cell by S, the median and the worst by name; empty where no prediction was kept.
 
     Of the later runs, predicted forward in time, where the training kept them, else of all, left out one by one.
     """
@@ -123,16 +81,11 @@ def left_out_batches(result: GridResult, choice: Choice) -> list[LeftOut]:
         table, protocol, column = (later, "forward", "predicted_um") if len(later) else (table, protocol, column)
     if column not in table.columns:
         return []
-    s = result.scores
-    rows = s[(s["protocol"] == protocol) & (s["selector"] == choice.selector) & (s["family"] == choice.family)]
-    rows = rows[(rows["n_tsp"] == choice.n_tsp) & np.isfinite(rows["S_um"])].sort_values("S_um", kind="stable")
+    rows = scores_of(result, choice.selector, choice.family, choice.n_tsp, protocol)
+    rows = rows[np.isfinite(rows["S_um"])].sort_values("S_um", kind="stable")
     ids, values = list(rows["batch_id"]), list(rows["S_um"])
-    places = dict(zip(_three(len(ids)), ("best", "median", "worst"), strict=False))
+    places = {len(ids) - 1: "worst", (len(ids) - 1) // 2: "median"}
     return [_left_out(table, protocol, column, ids[i], places.get(i, ""), float(values[i])) for i in range(len(ids))]
-
-
-def _three(n: int) -> Sequence[int]:
-    return list(dict.fromkeys([0, (n - 1) // 2, n - 1])) if n else []
 
 
 def _left_out(table: pd.DataFrame, protocol: str, column: str, batch_id: str, place: str, S_um: float) -> LeftOut:
@@ -155,210 +108,107 @@ def _left_out(table: pd.DataFrame, protocol: str, column: str, batch_id: str, pl
     )
 
 
-_MOST_GROUPS = 6
+def scores_of(result: GridResult, selector: str, family: str, n_tsp: int, protocol: str = "") -> pd.DataFrame:
+    """The scores of a cell, of one protocol or of all."""
+    s = result.scores
+    own = s[(s["selector"] == selector) & (s["family"] == family) & (s["n_tsp"] == n_tsp)]
+    return own[own["protocol"] == protocol] if protocol else own
+
+
 _STABLE = 0.7  # mean Jaccard similarity of the points that the folds choose
 _MAX = "max\u00a0|e|"
-_WHAT_A_DOT_IS = {"train-on-one": "the model of one batch, mean over the batches it predicts"}
+_ROUNDS = {"families": 1, "points": 2, "runs": 3}  # of `models.selection.race`
 
 
-@dataclass(frozen=True)
-class Promoted:
-    """The promoted cell with its `mark` in tables, and the decimals of a score."""
+def families(name: str, result: GridResult, choice: Choice, digits: int, mark: str = "chosen") -> Table:
+    """A row per family: its best cell by the first protocol, of the chosen family the chosen one, under all protocols.
 
-    choice: Choice
-    digits: int
-    mark: str = "chosen"
-
-
-def leaderboard(result: GridResult, cells: pd.DataFrame, key: str, promoted: Promoted, caption: str) -> Table:
-    """The best cell of every family or selector under one protocol, least score first; baselines always in it.
-
-    Args:
-        cells: one protocol's cells from `scored`.
-        key: family or selector.
-        promoted: its cell gets a row of its own where it is no row's best.
+    Notes name the families that the race dropped.
     """
-    choice, digits = promoted.choice, promoted.digits
-    base = is_baseline(cells)
-    rows = best_per(cells[~base], key)
-    own = _row_of(cells, choice)
-    if own is not None and not (rows[CELL_KEYS] == own[CELL_KEYS]).all(axis=1).any():
-        rows = pd.concat([rows, own.to_frame().T.astype(cells.dtypes)], ignore_index=True)
-    rows = pd.concat([rows, cells[base]], ignore_index=True).drop_duplicates(CELL_KEYS)
-    rows = rows.sort_values("S_mean_um", kind="stable").reset_index(drop=True)
-    protocol = str(rows["protocol"].iloc[0])
-    per_batch = [part["S_um"].to_numpy(float) for part in S_by_batch(result, rows)]
-    nothing = zero_um(cells)
-    scale = Scale.over(np.concatenate(per_batch).tolist(), 2.5 * nothing if nothing > 0 else math.inf)
-    groups = _groups(result, rows, protocol)
-    names = sorted({g for row in groups for g in row}, key=group_order)
-    columns = _columns(key, protocol, names)
-    body = []
-    for row, values, group in zip(rows.to_dict("records"), per_batch, groups, strict=True):
-        chosen = own is not None and all(row[k] == own[k] for k in CELL_KEYS)
-        unstable = row["tsp_stability"] < _STABLE
-        cells_of: dict[str, str | Strip] = {
-            "family": family_label(row["family"]),
-            "selector": selector_label(row["selector"]) if row["n_tsp"] else NOTHING,
-            "points": str(row["n_tsp"]) if row["n_tsp"] else NOTHING,
-            "S_mean": number(row["S_mean_um"], digits),
-            "S_std": number(row["S_std_um"], digits),
-            _MAX: number(row["max_abs_um"], 1),
-            "strip": _strip(values, float(row["S_mean_um"]), scale, digits),
-            "of no model": percent(row["S_mean_um"] / nothing) if nothing else NOTHING,
-            "fitted S": number(row["fit_S_um"], digits),
-            "stability": number(row["tsp_stability"], 2) + (" †" if unstable else "") if row["n_tsp"] else NOTHING,
-            **{n: number(group.get(n, math.nan), digits) for n in names},
-        }
-        body.append(Row(tuple(cells_of[c.key] for c in columns), promoted.mark if chosen else ""))
-    dots = _WHAT_A_DOT_IS.get(protocol, "a left-out batch")
-    notes = [f"Every dot is {dots} (log scale), the bar is S_mean; {_rests_on(result, protocol)}."]
-    if any(isinstance(cell, Strip) and cell.beyond for row in body for cell in row.cells):
-        notes.append("A number with › counts the dots beyond the axis.")
-    if any("†" in str(cell) for row in body for cell in row.cells):
-        notes.append(f"† Below {_STABLE:g}: another training would choose other points.")
-    return Table(caption, columns, tuple(body), result.simulated, scale, tuple(notes))
-
-
-def _columns(key: str, protocol: str, groups: Sequence[str]) -> tuple[Column, ...]:
-    """The columns of a leaderboard; those of left-out groups take the place of the last three."""
-    first = [Column("family"), Column("selector")]
-    last = (
-        [Column(n, "µm", "number") for n in groups]
-        or [
-            Column("of no model", "", "number"),
-            Column("fitted S", "µm", "number"),
-            Column("stability of points", "", "number", "stability"),
-        ]
-    )  # fmt: skip
-    return (
-        *(first if key == "family" else reversed(first)),
-        Column("points", "n", "number"),
-        Column("S_mean", "µm", "number"),
-        Column("S_std", "µm", "number"),
-        Column(_MAX, "µm", "number"),
-        Column("S per model" if protocol == "train-on-one" else "S per batch", "µm", "strip", "strip"),
-        *last,
-    )
-
-
-def heat_map(name: str, result: GridResult, cells: pd.DataFrame, digits: int) -> Table | None:
-    """S_mean of every family and selector at the best number of points; the darker, the smaller (logarithmic)."""
-    best = best_per(cells[~is_baseline(cells) & (cells["n_tsp"] > 0)], "family", "selector")
-    if best.empty:
-        return None
-    log_um = np.log10(np.maximum(best["S_mean_um"].to_numpy(float), 1e-3))
-    nothing = zero_um(cells)
-    low = float(log_um.min())
-    high = max(min(float(log_um.max()), math.log10(nothing) if nothing > 0 else math.inf), low + 0.1)
-    share = np.clip((high - log_um) / (high - low), 0.0, 1.0)
-    shades = {
-        (r["family"], r["selector"]): Shade(number(r["S_mean_um"], digits), f"n = {r['n_tsp']}", float(v))
-        for r, v in zip(best.to_dict("records"), share, strict=True)
-    }
-    families, selectors = (list(dict.fromkeys(best[k])) for k in ("family", "selector"))
-    rows = [Row((family_label(f), *(shades.get((f, s), NOTHING) for s in selectors))) for f in families]
-    columns = (Column("family"), *(Column(selector_label(s), "", "shade") for s in selectors))
-    levels = [
-        f"{family_label(r['family'])} {number(r['S_mean_um'], digits)} µm"
-        for r in best_per(cells[cells["n_tsp"] == 0], "family").to_dict("records")
-    ]
-    notes = ["For each pair the number of points n with the least score. The darker, the smaller the error left."]
-    notes += [f"Without temperature points: {listed(levels)}."] if levels else []
-    caption = f"{name}: S_mean of every family and selector, µm"
-    return Table(caption, columns, tuple(rows), result.simulated, None, tuple(notes))
-
-
-_MOST_POINTS_SHOWN = 24
-
-
-def point_frequency(name: str, result: GridResult, cells: pd.DataFrame, protocol: str) -> Table | None:
-    """How often the folds of each selector chose each point, most often chosen first; None where there is no choice."""
-    found = frequencies(result, cells, protocol)
-    if not found:
-        return None
-    total = {point: sum(f.share.get(point, 0.0) for f in found) for f in found for point in f.share}
-    points = sorted(total, key=lambda p: (-total[p], p))
-    rows = [
-        Row((p, *(Shade(percent(v) if v else "", "", v) for f in found for v in [f.share.get(p, 0.0)])))
-        for p in points[:_MOST_POINTS_SHOWN]
-    ]
-    columns = (Column("point"), *(Column(selector_label(f.selector), f"n = {f.n_tsp}", "shade") for f in found))
-    stable = [f"{selector_label(f.selector)} {number(f.stability, 2)}" for f in found]
-    notes = [f"Share of the folds, at each selector's best n short of all. Mean Jaccard similarity: {listed(stable)}."]
-    if len(points) > _MOST_POINTS_SHOWN:
-        notes.append(f"The {_MOST_POINTS_SHOWN} most often chosen of {len(points)} points.")
-    caption = f"{name}: how often each point is chosen"
-    return Table(caption, columns, tuple(rows), result.simulated, None, tuple(notes))
-
-
-def batches(result: GridResult, choice: Choice, digits: int) -> Table:
-    """Every batch: when, how it ran, and its S without a model and left out by the promoted one."""
-    s = result.scores[result.scores["protocol"] == MAIN_PROTOCOL]
-    own = s[(s["selector"] == choice.selector) & (s["family"] == choice.family) & (s["n_tsp"] == choice.n_tsp)]
-    own = own.drop_duplicates("batch_id").set_index("batch_id")
-    zero = s[s["family"] == "zero"].drop_duplicates("batch_id").set_index("batch_id")
-    out = []
-    for row in result.batches.to_dict("records"):
-        b = row["batch_id"]
-        out.append(
+    protocols = protocols_of(result)
+    cells = scored(result, protocols[0])
+    own = (cells[KEYS] == [choice.selector, choice.family, choice.n_tsp]).all(axis=1)
+    best = best_per(pd.concat([cells[own], cells]), "family").sort_values("S_mean_um", kind="stable")
+    at = {tuple(r[k] for k in ("protocol", *KEYS)): r for r in result.cells.to_dict("records")}
+    rows = []
+    for r in best.to_dict("records"):
+        under = [at.get((p, *(r[k] for k in KEYS))) for p in protocols]
+        stable = number(r["tsp_stability"], 2) + (" †" if r["tsp_stability"] < _STABLE else "")
+        rows.append(
             Row.of(
-                str(b),
-                str(row.get("start") or NOTHING).replace("T", " ")[:16].removesuffix(" 00:00"),
-                str(row.get("speed", "–")),
-                number(float(row.get("start_ambient_degC", math.nan)), 1),
-                f"{row['n_rows']}",
-                number(_at(zero, b, "S_um"), digits),
-                number(_at(own, b, "S_um"), digits),
-                number(_at(own, b, "max_abs_um"), 1),
-                number(_at(own, b, "bias_um"), 1, sign=True),
+                cell_label(r["selector"], r["family"], r["n_tsp"]),
+                *(NOTHING if u is None else plus_minus(u["S_mean_um"], u["S_std_um"], digits) for u in under),
+                number(r["max_abs_um"], 1),
+                number(r["fit_S_um"], digits),
+                stable if r["n_tsp"] else NOTHING,
+                mark=mark if r["family"] == choice.family else "",
             )
         )
     columns = (
-        Column("batch"),
-        Column("start"),
-        Column("speed"),
-        Column("start ambient", "°C", "number"),
-        Column("samples", "", "number"),
-        Column("S, no model", "µm", "number"),
-        Column("S, left out", "µm", "number"),
-        Column(_MAX, "µm", "number"),
-        Column("mean e", "µm", "number"),
-    )
-    label = cell_label(choice.selector, choice.family, choice.n_tsp)
-    return Table(f"Every batch, left out by {label}", columns, tuple(out), result.simulated)
+        Column("cell"), *(Column(p, "S_mean ± S_std, µm", "number") for p in protocols), Column(_MAX, "µm", "number"),
+        Column("fitted S", "µm", "number"), Column("stability", "of points", "number"),
+    )  # fmt: skip
+    notes = ["Numbers of different protocols are not comparable."]
+    if any("†" in str(r.cells[-1]) for r in rows):
+        notes.append(f"† The folds choose different points (stability below {_STABLE:g}): another run may move them.")
+    notes += _dropped(result, set(best["family"]), digits)
+    return Table(f"{name}: best cell of every family", columns, tuple(rows), notes=tuple(notes))
 
 
-def _row_of(cells: pd.DataFrame, choice: Choice) -> pd.Series | None:
-    hit = cells[
-        (cells["selector"] == choice.selector) & (cells["family"] == choice.family) & (cells["n_tsp"] == choice.n_tsp)
-    ]
-    return hit.iloc[0] if len(hit) else None
+def _dropped(result: GridResult, known: set[str], digits: int) -> list[str]:
+    """Of every other family in the race its best cell in the last round that it was in, and why it went no further."""
+    if result.race.empty:
+        return []
+    race = result.race[~result.race["family"].isin(known)]
+    race = race.assign(place=race["round"].map(_ROUNDS))
+    order = race.sort_values(["place", "S_mean_um"], ascending=[False, True], kind="stable").drop_duplicates("family")
+    notes = []
+    for _, own in order.sort_values("S_mean_um", kind="stable").groupby(["place", "why", "n_runs"]):
+        first = own.iloc[0]
+        cells = (
+            f"{cell_label(r['selector'], r['family'], r['n_tsp'])} {number(r['S_mean_um'], digits)} µm"
+            for r in own.to_dict("records")
+        )
+        head = f"Dropped in round {first['place']} of the race, {first['why']}"
+        notes.append(f"{head} (S_mean over {count(int(first['n_runs']), 'run')}): {', '.join(cells)}.")
+    return notes
 
 
-def _strip(values: np.ndarray, mean_um: float, scale: Scale, digits: int) -> Strip:
-    good = np.sort(values[np.isfinite(values)])
-    beyond = int((good > scale.high_um).sum())
-    if not len(good):
-        return Strip((), 0.0, 0, NOTHING)
-    label = f"{number(good[0], digits)} to {number(good[-1], digits)}, median {number(float(np.median(good)), digits)}"
-    return Strip(tuple(scale.at(float(v)) for v in good), scale.at(mean_um), beyond, label)
+_GROUPS = {"season": "leave-season-out", "speed": "leave-speed-out"}
 
 
-def _groups(result: GridResult, rows: pd.DataFrame, protocol: str) -> list[dict[str, float]]:
-    """Per row the mean S of every left-out season or speed; empty for the protocols of single batches."""
-    if protocol in (MAIN_PROTOCOL, "train-on-one"):
-        return [{} for _ in range(len(rows))]
-    parts = [part.groupby("fold", sort=False)["S_um"].mean() for part in S_by_batch(result, rows)]
-    if max((len(p) for p in parts), default=0) > _MOST_GROUPS:
-        return [{} for _ in range(len(rows))]
-    return [{_short(str(k)): float(v) for k, v in part.items()} for part in parts]
+def groups(name: str, result: GridResult, choice: Choice, protocol: str, digits: int) -> Table | None:
+    """Every season and speed: S of the model by a protocol, with the group left out, without a model; worst marked."""
+    own = scores_of(result, choice.selector, choice.family, choice.n_tsp)
+    nothing = scores_of(result, "none", "zero", 0)
+    rows: list[tuple[float, Row]] = []
+    for kind, group_protocol in _GROUPS.items():
+        if kind not in result.batches or result.batches[kind].nunique() < 2:
+            continue
+        label = result.batches.set_index(result.batches["batch_id"].astype(str))[kind].astype(str)
+        means = [
+            _means(part, p, label)
+            for part, p in ((own, protocol), (own, group_protocol), (nothing, MAIN_PROTOCOL))
+        ]  # fmt: skip
+        counts = label.value_counts()
+        for group in sorted(counts.index, key=group_order):
+            shown = [float(m.get(group, math.nan)) for m in means]
+            worst = max((v for v in shown[:2] if math.isfinite(v)), default=math.nan)
+            rows.append((worst, Row.of(f"{kind} {group}", str(counts[group]), *(number(v, digits) for v in shown))))
+    if not rows:
+        return None
+    top = max((v for v, _ in rows if math.isfinite(v)), default=math.nan)
+    columns = (
+        Column("group"), Column("runs", "", "number"), Column(protocol, "µm", "number"),
+        Column("whole group left out", "µm", "number"), Column("no model", "µm", "number"),
+    )  # fmt: skip
+    marked = tuple(Row(r.cells, "worst" if v == top else "") for v, r in rows)
+    return Table(f"{name}: S_mean by season and speed", columns, marked)
 
 
-def _short(fold: str) -> str:
-    """A block of runs by its first day."""
-    first, _, last = fold.partition(" to ")
-    return f"from {first}" if last else first
+def _means(scores: pd.DataFrame, protocol: str, label: pd.Series) -> pd.Series:
+    own = scores[scores["protocol"] == protocol]
+    return own["S_um"].groupby(own["batch_id"].astype(str).map(label)).mean()
 
 
 def group_order(name: str) -> tuple[int, float, str]:
@@ -368,12 +218,105 @@ def group_order(name: str) -> tuple[int, float, str]:
     return (side if found else 2, float(found[0]) if found else 0.0, name)
 
 
+_BOUNDED = ("forward", "leave-season-out", "leave-speed-out", MAIN_PROTOCOL)
+
+
+def bounds(name: str, left_out: pd.DataFrame, digits: int) -> Table | None:
+    """A row per protocol: its left-out runs against the S expected from their inputs and against the 90 % bound.
+
+    Args:
+        left_out: of `models.selection.trust.left_out_runs`; None comes of one without a measured run.
+    """
+    if left_out.empty or not (known := left_out["protocol"].isin(_BOUNDED) & (left_out["S_um"] > 0)).any():
+        return None
+    runs, bound = left_out[known], RunBound.of(left_out[known])
+    apart = runs["disagreement_um"] if "disagreement_um" in runs else [math.nan] * len(runs)
+    factor = np.array([bound.factor(*pair) for pair in zip(apart, runs["distance"], strict=True)])
+    runs = runs.assign(expected_um=bound.expected_um * factor, most_um=bound.bound_um * factor)
+    rows = []
+    for protocol in [p for p in _BOUNDED if (runs["protocol"] == p).any()]:
+        own = runs[runs["protocol"] == protocol]
+        values = (number(own[c].mean(), digits) for c in ("S_um", "expected_um", "most_um"))
+        below = percent(float((own["S_um"] <= own["most_um"]).mean()))
+        rows.append(Row.of(protocol, str(len(own)), *values, below))
+    columns = (
+        Column("protocol"), Column("left-out runs", "", "number"), Column("S_mean", "µm", "number"),
+        Column("expected", "µm", "number"), Column("90 % bound", "µm", "number"),
+        Column("below the bound", "", "number"),
+    )  # fmt: skip
+    notes = [
+        f"S grows with the disagreement of the best of other families to the power {number(bound.slopes[0], 2)} and "
+        f"with (1 + distance from the trained region) to the power {number(bound.slopes[1], 2)}. A run is flagged "
+        f"where they disagree by more than {number(bound.usual_um, digits)} µm, or its distance is above "
+        f"{number(bound.tested, 2)} trained widths. The bound comes from these runs: its share below is no test of it."
+    ]
+    far = left_out.loc[(left_out["protocol"] == "forward") & (left_out["distance"] > SLACK), "farthest"].value_counts()
+    if len(far):
+        common = ", ".join(f"{q} ({n})" for q, n in far.head(3).items())
+        notes.append(f"Later runs left the trained region most often in {common}.")
+    return Table(f"{name}: error to expect of a run", columns, tuple(rows), notes=tuple(notes))
+
+
+_READINGS = {  # of `models.selection.updating.SCHEDULES`
+    f"{COUNTS[0]} evenly": "none, free-running",
+    "one a shift": "one, after the first hour",
+    "one reading an hour": "one an hour",
+}
+
+
+def readings(name: str, result: GridResult, digits: int) -> Table | None:
+    """What readings of a touch probe are worth: none, one a shift, one an hour; None where it was not measured."""
+    found = result.readings
+    if found.empty:
+        return None
+    rows = []
+    for schedule, label in _READINGS.items():
+        own = found[found["schedule"] == schedule]
+        scores = (plus_minus(float(own[c].mean()), float(own[c].std()), digits) for c in ("S_um", "held_S_um"))
+        stated = NOTHING if label.startswith("none") else percent(float(own["coverage90"].mean()))
+        rows.append(Row.of(label, *scores, stated))
+    columns = (
+        Column("readings of a run"), Column("updated by the filter", "S_mean ± S_std, µm", "number"),
+        Column("last residual held", "S_mean ± S_std, µm", "number"), Column("inside the stated 90 %", "", "number"),
+    )  # fmt: skip
+    note = (
+        f"{count(found['batch_id'].nunique(), 'later run')}, predicted from earlier ones. A Kalman filter learned from "
+        "the training runs moves offset, gains and drift of the prediction at every reading; rows before a reading do "
+        "not know it. The plain way holds the residual of the last reading."
+    )
+    return Table(f"{name}: error with readings of a touch probe", columns, tuple(rows), notes=(note,))
+
+
+def batches(name: str, result: GridResult, choice: Choice, digits: int) -> Table:
+    """Every batch: when, how it ran, and its S without a model and left out by the promoted one."""
+    own = scores_of(result, choice.selector, choice.family, choice.n_tsp, MAIN_PROTOCOL)
+    own = own.drop_duplicates("batch_id").set_index("batch_id")
+    s = result.scores[result.scores["protocol"] == MAIN_PROTOCOL]
+    zero = s[s["family"] == "zero"].drop_duplicates("batch_id").set_index("batch_id")
+    rows = []
+    for row in result.batches.to_dict("records"):
+        b = row["batch_id"]
+        rows.append(
+            Row.of(
+                str(b),
+                str(row.get("start") or NOTHING).replace("T", " ")[:16].removesuffix(" 00:00"),
+                str(row.get("speed", NOTHING)),
+                number(float(row.get("start_ambient_degC", math.nan)), 1),
+                f"{row['n_rows']}",
+                number(_at(zero, b, "S_um"), digits),
+                number(_at(own, b, "S_um"), digits),
+                number(_at(own, b, "max_abs_um"), 1),
+                number(_at(own, b, "bias_um"), 1, sign=True),
+            )
+        )
+    columns = (
+        Column("batch"), Column("start"), Column("speed"), Column("start ambient", "°C", "number"),
+        Column("samples", "", "number"), Column("S, no model", "µm", "number"), Column("S, left out", "µm", "number"),
+        Column(_MAX, "µm", "number"), Column("mean e", "µm", "number"),
+    )  # fmt: skip
+    label = cell_label(choice.selector, choice.family, choice.n_tsp)
+    return Table(f"{name}: every batch, left out by {label}", columns, tuple(rows))
+
+
 def _at(table: pd.DataFrame, batch_id: str, column: str) -> float:
     return float(table[column].get(batch_id, math.nan)) if column in table else math.nan
-
-
-def _rests_on(result: GridResult, protocol: str) -> str:
-    """How many folds and batches a protocol's numbers rest on."""
-    s = result.scores[result.scores["protocol"] == protocol]
-    tested = len(result.batches) if protocol == "train-on-one" else s["batch_id"].nunique()
-    return f"{count(int(s['fold'].nunique()), 'fold')}, {count(int(tested), 'batch')} predicted"

@@ -124,7 +124,7 @@ def modes(views: Sequence[ModeView], view: Overview, most: int = 10) -> Table:
     ]
     columns = [Column("time constant"), Column("what moves", kind="wide")]
     for c in channels:
-        columns += [Column(c, units[c], "number", f"{c} unit"), Column(c, "share", "number", f"{c} share")]
+        columns += [Column(c, units[c], "number"), Column(c, "share", "number")]
     notes = (
         "What the mode brings to the displacement of the steady state, arriving as 1 − exp(−t / time constant). "
         "Share: its magnitude by the sum of all magnitudes; modes of opposite sign cancel.",

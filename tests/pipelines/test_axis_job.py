@@ -24,7 +24,8 @@ from pipelines.commands.predict import predict_file
 from pipelines.jobs.request import TrainRequest, check_request
 from pipelines.store import model_store
 from reports.comparison import figure_pngs, write_report
-from reports.comparison.channel import left_out_panel
+from reports.comparison.channel import Channel
+from reports.comparison.pictures import left_out_panels
 from reports.comparison.tables import left_out_batches
 from tests.reports.test_report_browser import CHROMIUM, console, measured, open_page
 from tests.toys.report_training import settings, training
@@ -59,10 +60,10 @@ def page(result: GridResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_fan_shows_every_reading_and_the_lines_of_the_left_out_model(result: GridResult) -> None:
     shown = [b for b in left_out_batches(result, choose(result, PromotionRule())) if b.place]
-    assert [b.place for b in shown] == ["best", "median", "worst"]
-    panel = left_out_panel("x_axis", result, shown, 1)
-    assert panel is not None and len(panel.plots) == 3
-    assert panel.caption == f"x_axis: recorded and predicted along the axis, {shown[0].protocol}"
+    assert [b.place for b in shown] == ["median", "worst"]
+    (panel,) = left_out_panels([Channel.of("x_axis", [training(result)], PromotionRule())])
+    assert len(panel.plots) == 2
+    assert panel.caption == f"Runs left out: recorded and predicted along the axis, {shown[0].protocol}"
     for batch, plot in zip(shown, panel.plots, strict=True):
         assert batch.position_mm is not None and batch.every == 1
         upper, lower = plot.figure.axes
@@ -84,8 +85,8 @@ def test_the_fan_shows_every_reading_and_the_lines_of_the_left_out_model(result:
 
 def test_the_page_and_the_small_pictures_are_made(result: GridResult, page: Path, tmp_path: Path) -> None:
     html = page.read_text(encoding="utf-8")
-    assert "x_axis: recorded and predicted along the axis" in html and 'class="viewer"' not in html
-    assert figure_pngs(result)["left_out.png"].startswith(b"\x89PNG")
+    assert "recorded and predicted along the axis" in html and 'class="viewer"' not in html
+    assert figure_pngs(result)["left_out_median.png"].startswith(b"\x89PNG")
     text = write_report([training(result)], tmp_path / "r.md", settings(tmp_path).promotion).read_text(encoding="utf-8")
     assert "axis coupled" in text
 
@@ -94,8 +95,8 @@ def test_the_page_and_the_small_pictures_are_made(result: GridResult, page: Path
 def test_no_label_of_a_fan_is_cut_or_covered_in_a_browser(page: Path, tmp_path: Path) -> None:
     _, log = open_page(page, tmp_path)
     assert console(log) == []
-    fans = [p for p in measured(page, 390, tmp_path)["pictures"] if p["small"]]
-    assert len(fans) == 3 and all(p["cut"] == p["covered"] == [] and p["width"] > 300 for p in fans)
+    plots = measured(page, 390, tmp_path)["pictures"]
+    assert len(plots) == 2 + 2 and all(p["cut"] == p["covered"] == [] and p["width"] > 300 for p in plots)
 
 
 def test_a_stored_model_predicts_a_raw_recording(recordings: list[Path], machine: Machine, tmp_path: Path) -> None:

@@ -39,8 +39,7 @@ MEASURE = """<script>addEventListener("load", () => setTimeout(() => {
     const svg = box.querySelector("svg").getBoundingClientRect()
     const texts = [...box.querySelectorAll("text")].map(t => [t.textContent, t.getBoundingClientRect()])
     const others = i => texts.slice(i + 1)
-    const small = box.parentElement.classList.contains("third")
-    return {id: box.id, small, width: svg.width, right: box.getBoundingClientRect().right, box: box.clientWidth,
+    return {id: box.id, width: svg.width, right: box.getBoundingClientRect().right, box: box.clientWidth,
             texts: texts.length, cut: texts.filter(([, r]) => !inside(r, svg)).map(([t]) => t),
             covered: texts.flatMap(([t, r], i) => others(i).filter(([, s]) => !apart(r, s)).map(([u]) => [t, u]))}
   })
@@ -104,9 +103,9 @@ def test_the_page_is_shown_without_an_error_and_its_viewers_are_drawn(page: Path
     dom, log = open_page(page, scratch)
     assert console(log) == []
     assert not re.search(r">[^<]*&amp;(#|lt|gt|amp)", unscripted(dom)), "markup shown as it stands"
-    assert dom.count("<canvas") == 2 * 2, "two charts for each of two channels"
-    assert len(re.findall(r"<option value=", dom)) == 2 * 4, "every later run can be chosen"
-    assert len(re.findall(r"0.0 to 3.3 h. residual: rms \d", dom)) == 2
+    assert dom.count("<canvas") == 2, "the run and its residual"
+    assert len(re.findall(r"<option value=", dom)) == 4 + 2, "every later run and both channels can be chosen"
+    assert len(re.findall(r"0.0 to 3.3 h. residual: rms \d", dom)) == 1
 
 
 USE = """<script>addEventListener("load", () => setTimeout(() => {
@@ -164,11 +163,11 @@ def test_tables_sort_by_value_and_long_ones_filter(scratch: Path) -> None:
 def test_every_picture_is_readable_and_nothing_overflows_the_page(width_px: int, page: Path, scratch: Path) -> None:
     found = measured(page, width_px, scratch)
     assert found["page"] <= width_px
-    assert len(found["pictures"]) == 2 * 7 + 1
+    assert len(found["pictures"]) == 2 * 4
     for p in found["pictures"]:
         assert p["right"] <= width_px and p["width"] >= 300 and p["texts"] > 8, p
         assert p["cut"] == [] and p["covered"] == [], p
-        assert p["width"] <= p["box"] or not p["small"], f"{p['id']}: curves of one batch need no scrolling"
+        assert p["width"] <= p["box"], f"{p['id']}: a plot needs no scrolling"
 
 
 @pytest.mark.slow

@@ -103,7 +103,7 @@ def false_claims(claims: pd.DataFrame, plants: Sequence[str]) -> Table:
 
 
 def _plants(said: str, plants: Sequence[str]) -> list[Column]:
-    return [Column(f"{said}{plant_letter(p)}", plant_origin(p), "number", p) for p in plants]
+    return [Column(f"{said}{plant_letter(p)}", plant_origin(p), "number") for p in plants]
 
 
 def _by_plant(rows: pd.DataFrame, plants: Sequence[str]) -> list[str]:

@@ -114,7 +114,7 @@ _RARE = 0.05
 
 def cases(outcomes: pd.DataFrame, plants: Sequence[str]) -> Table:
     """Number of cases of each kind on each plant, and of entirely right answers."""
-    columns = [Column("concealed"), *(Column(plant_letter(p), plant_origin(p), "number", p) for p in plants),
+    columns = [Column("concealed"), *(Column(plant_letter(p), plant_origin(p), "number") for p in plants),
                Column("all", kind="number"), Column("visible", kind="number")]  # fmt: skip
     judged = "right" in outcomes.columns and outcomes["right"].notna().any()
     columns += [Column("entirely right", kind="number")] if judged else []
