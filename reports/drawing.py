@@ -20,6 +20,7 @@ LINES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7d6
 SIGNED = LinearSegmentedColormap.from_list("signed", ["#004d7a", "#5fa3cf", "#ffffff", "#e99a66", "#963f00"])
 SIZE = LinearSegmentedColormap.from_list("size", ["#ffffff", "#8ebbd9", "#0b5a8f"])
 WIDTH_IN = 10.5
+THIRD_IN = 3.35  # 360 px on the page
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,16 @@ def head(fig: Figure, title: str, simulated: bool) -> None:
     fig.text(0.1 / wide, y, tex_escaped(title), fontsize=11.5, color=INK, fontweight="bold", va="center")
     if simulated:
         fig.text(1 - 0.1 / wide, y, "SIMULATED", fontsize=10, color=ORANGE, fontweight="bold", ha="right", va="center")
+
+
+def headed(fig: Figure, title: str, simulated: bool) -> None:
+    """As `head`, for a small figure whose page names what it shows."""
+    wide, y = fig.get_figwidth(), 1 - 0.14 / fig.get_figheight()
+    fig.text(0.04 / wide, y, tex_escaped(title), fontsize=8.5, color=INK, va="center")
+    if simulated:
+        fig.text(
+            1 - 0.05 / wide, y, "SIMULATED", fontsize=7.5, color=ORANGE, fontweight="bold", va="center", ha="right"
+        )
 
 
 def legend_row(fig: Figure, entries: Sequence[tuple[str, str, str]], left_in: float, top_in: float) -> None:

@@ -233,12 +233,11 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Number:
-    """A large number with what it is; `before` is what it was."""
+    """A large number with what it is."""
 
     label: str
     value: str
     what: str = ""
-    before: str = ""
 
 
 @dataclass(frozen=True)
@@ -246,7 +245,6 @@ class Numbers:
     """Large numbers in a row."""
 
     entries: tuple[Number, ...]
-    look: Literal["headline", "figures"] = "headline"
 
 
 @dataclass(frozen=True)
@@ -257,25 +255,6 @@ class Heading:
     chip: tuple[str, str] = ("", "")
     simulated: bool = False
     level: Literal[2, 3] = 3
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A claim with its number, where and when it holds, and its probability in words and in percent."""
-
-    number: int
-    statement: str
-    where: tuple[tuple[str, str], ...]
-    probability: str
-    likelihood: str
-    percent: float
-
-
-@dataclass(frozen=True)
-class Claims:
-    """Numbered claims."""
-
-    entries: tuple[Claim, ...]
 
 
 @dataclass(frozen=True)
@@ -354,5 +333,5 @@ def given(*blocks: Any) -> tuple[Any, ...]:
 
 def _empty(block: Any) -> bool:
     """A text, a list or a group whose first field, its content, is empty."""
-    of_content = isinstance(block, Text | Items | Pairs | Numbers | Claims | Group)
+    of_content = isinstance(block, Text | Items | Pairs | Numbers | Group)
     return of_content and not next(iter(vars(block).values()))

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from data.arrays import Array
 from data.sweeps import sweep_numbers
 from reports.comparison.tables import LeftOut
-from reports.drawing import GREY, MUTED, panel
+from reports.drawing import GREY, MUTED, THIRD_IN, headed, panel
 from reports.labels import BLUE, INK, ORANGE, family_label, number, selector_label, tex_escaped
 from reports.layout import Scale
 
-THIRD_IN = 3.35  # 360 px on the page
 _LEFT_IN, _RIGHT_IN = 0.42, 0.08  # room for tick labels
 
 
@@ -84,7 +83,7 @@ def tried(cells: pd.DataFrame, chosen: str, title: str, levels_um: Mapping[str, 
     ax.set_yticks(range(len(least)), [family_label(f) for f in least["family"]], fontsize=7.5)
     ax.set_ylim(len(least) - 0.4, -0.6)
     ax.set_xlabel("S_mean, µm", fontsize=8, color=MUTED, labelpad=2)
-    _headed(fig, title, simulated)
+    headed(fig, title, simulated)
     return fig
 
 
@@ -94,15 +93,6 @@ LEVELS = {"no model": ":", "mean curve": "--"}
 def _chosen_by(cell: dict[Any, Any]) -> str:
     """``mRMR, 4``: the selector and the number of its points."""
     return f"{selector_label(cell['selector'])}, {cell['n_tsp']}" if cell["n_tsp"] else ""
-
-
-def _headed(fig: Figure, title: str, simulated: bool) -> None:
-    """The title in the upper left corner; simulated data are called so in the right one."""
-    y = 1 - 0.14 / fig.get_figheight()
-    fig.text(0.04 / THIRD_IN, y, tex_escaped(title), fontsize=8.5, color=INK, va="center")
-    if simulated:
-        style: Any = {"fontsize": 7.5, "color": ORANGE, "fontweight": "bold", "va": "center", "ha": "right"}
-        fig.text(1 - 0.05 / THIRD_IN, y, "SIMULATED", **style)
 
 
 def in_order(runs: pd.DataFrame, bound_um: float, title: str, simulated: bool) -> Figure:
@@ -124,7 +114,7 @@ def in_order(runs: pd.DataFrame, bound_um: float, title: str, simulated: bool) -
     if len(ticks) > 1:
         ticks[-1].label1.set_horizontalalignment("right")
     ax.set_xlim(-0.9, len(runs) - 0.1)
-    _headed(fig, title, simulated)
+    headed(fig, title, simulated)
     return fig
 
 

@@ -10,7 +10,7 @@ from data.units import unit_label
 from diagnosis.findings.schema import DetectionLimit, Finding, Findings
 from reports.diagnosis import tables
 from reports.labels import count, listed, three_digits
-from reports.layout import Group, Heading, Number, Pairs, Text
+from reports.layout import Group, Heading, Pairs, Text
 
 Outcome = Literal["found", "found_and_more", "other_place", "in_set", "missed", "wrong", "false_alarm", "nothing_right"]
 RIGHT: tuple[Outcome, ...] = ("found", "nothing_right")  # outcomes of an answer that is right as a whole
@@ -52,24 +52,23 @@ class Unsealed:
         """The outcome in plain words."""
         return _HEADLINES[self.outcome]
 
-    def panel(self, figures: Sequence[Number], corrected: bool) -> Group:
-        """Outcome, what was concealed and named, `figures` (before and after where `corrected`), and the seal."""
+    def panel(self, errors: Sequence[str], corrected: bool) -> Group:
+        """Outcome, what was concealed and named, left-out errors (before and after where `corrected`), and the seal."""
         named, x = f"nothing; verdict: {tables.CHIPS[self.verdict]}", self.finding
         lines = []
         if x is not None:
-            named = effect_label(x)
+            named = tables.effect_label(x)
             sure = f"{tables.probability_label(x.probability)}, {tables.likelihood(x.probability)}"
             lines += [Text(values_label(x), "small"), Text(f"probability {sure}", "small")]
         if self.false:
-            untrue = listed([effect_label(x) for x in self.false], MOST_PARAMETERS)
+            untrue = listed([tables.effect_label(x) for x in self.false], MOST_PARAMETERS)
             lines.append(Text(f"not true: {untrue}", "wrong"))
         found = "Named" if self.outcome in ("missed", "wrong", "false_alarm", "nothing_right") else "Found"
-        errors = [k for k in figures if k.label.endswith("rms")]
         left = "Left-out error, before → after" if corrected else "Left-out error, nothing corrected"
         three = (
             ("Concealed", self.concealed[:1].upper() + self.concealed[1:]),
             (found, (Text(named[:1].upper() + named[1:]), *(t for t in lines if t.text))),
-            (left, tuple(Text(_error_line(k)) for k in errors)),
+            (left, tuple(Text(line) for line in errors)),
         )
         when = self.sealed_at.replace("T", " ").replace("Z", " UTC")
         note = (
@@ -85,11 +84,6 @@ class Unsealed:
             Text(f"seal, SHA-256: {self.digest}", "note digest"),
         )
         return Group(blocks, f"unsealed {'right' if self.outcome in RIGHT else 'off'}")
-
-
-def _error_line(k: Number) -> str:
-    """``z 31.2 → 4.1 µm, noise 0.8 µm`` of a figure ``z, left-out rms``."""
-    return f"{k.label.split(',')[0]} {f'{k.before} → ' if k.before else ''}{k.value}, {k.what}"
 
 
 @dataclass(frozen=True)
@@ -117,13 +111,6 @@ class Continued:
         return [f"{text}." for text in said]
 
 
-def effect_label(x: Finding) -> str:
-    """``heat to the floor at bed``, ``poorly bonded sensor: column_front``, ``bending of a column in the z error``."""
-    what, name = tables.mechanism_label(x.mechanism), x.where.name
-    place = {"sensor": f": {name}", "error": f" in the {name} error", "link": f" at the link {name}"}
-    return what + place.get(x.where.kind, f" at {name}")
-
-
 def values_label(x: Finding) -> str:
     """``conductance 10.2 W/K (90 %: 8.9 to 11.6), follow 0.48``, three at most and how many more there are."""
     known = [(n, p) for n, p in x.parameters.items() if p.value is not None]
@@ -147,12 +134,12 @@ def _first(before: Findings, after: Findings) -> str:
         return "none before and none now"
     if old is not None and new is not None and (old.mechanism, old.where) == (new.mechanism, new.where):
         chances = (tables.probability_label(x.probability) for x in (old, new))
-        return f"{effect_label(new)}, {' → '.join(chances)}"
+        return f"{tables.effect_label(new)}, {' → '.join(chances)}"
     return " → ".join("none" if x is None else _with_probability(x) for x in (old, new))
 
 
 def _with_probability(x: Finding) -> str:
-    return f"{effect_label(x)} ({tables.probability_label(x.probability)})"
+    return f"{tables.effect_label(x)} ({tables.probability_label(x.probability)})"
 
 
 def shortened(statement: str, most: int = MOST_PARAMETERS) -> str:

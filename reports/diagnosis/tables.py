@@ -12,9 +12,9 @@ import pandas as pd
 from scipy.stats import chi2
 
 from data.units import unit_label
-from diagnosis.findings.schema import Finding, FoundParameter, LeftOutRms, NextExperiment
+from diagnosis.findings.schema import Alternative, Finding, LeftOutRms, NextExperiment
 from diagnosis.policy import POLICY
-from reports.labels import NOTHING, between, count, listed, number, percent, three_digits
+from reports.labels import NOTHING, count, digits_of, number, percent, three_digits
 from reports.layout import Column, Row, Table
 from reports.twin.tables import quantity
 
@@ -59,10 +59,7 @@ GLOSSARY = (
     ("unexplained heat, displacement, reading", "What a smooth free input at that place would have to be to close the "
      "gap, the free parameters readjusted. + : the recording has more than the simulation."),
     ("z", "Such a value by its own standard deviation."),
-    ("cluster", "Candidates whose signatures agree so closely that these recordings cannot distinguish them."),
     ("detection limit", "The least effect that these recordings would have shown."),
-    ("autocorrelation", "How alike the residual is to itself some time later: 0 for noise, near 1 for physics that is "
-     "missing."),
     ("likelihood terms", "After Mastrandrea et al. 2010: virtually certain from 99 %, extremely likely from 95 %, very "
      "likely from 90 %, likely from 66 %, more likely than not from 50 %."),
 )  # fmt: skip
@@ -130,14 +127,6 @@ def mechanism_label(key: str) -> str:
     return MECHANISMS[key].summary if key in MECHANISMS else key.replace("_", " ")
 
 
-def alternatives_label(others: Sequence[tuple[str, str, str, float]]) -> str:
-    """``radiation at bed (2 %)`` for every (mechanism, kind, name, probability)."""
-    said = [
-        f"{mechanism_label(key)} at {place_label(kind, name)} ({probability_label(p)})" for key, kind, name, p in others
-    ]
-    return listed(said, 4)
-
-
 def experiment_sentence(run: NextExperiment) -> str:
     """The run as a sentence, with its hours."""
     hours = "" if run.hours is None else f"; {run.hours:.3g} h in all"
@@ -153,10 +142,10 @@ def _spelled(n: int) -> str:
     return {0: "no", 2: "two", 3: "three", 4: "four", 5: "five"}.get(n, str(n))
 
 
-_MOST_CANDIDATES, _MOST_CHANNELS = 12, 10
+_MOST_CANDIDATES, _MOST_CHANNELS, _MOST_LIMITS = 12, 10, 30
 
 
-def candidates(table: pd.DataFrame, simulated: bool, accepted: Mapping[tuple[str, str], float]) -> Table:
+def candidates(table: pd.DataFrame, accepted: Mapping[tuple[str, str], float]) -> Table:
     """The best of everything that was tried; those accepted are marked.
 
     Args:
@@ -168,26 +157,43 @@ def candidates(table: pd.DataFrame, simulated: bool, accepted: Mapping[tuple[str
     rows = [
         Row.of(
             str(r["words"]),
+            _chance(accepted.get((str(r["mechanism"]), place(r)), float(r["probability"]))),
+            _amplitude(r, "amplitude"),
             _nats(r["gain"], sign=True),
             f"{int(r['improved'])} of {int(r['batches'])}",
-            _amplitude(r, "amplitude"),
             percent(float(r["absorbed"])),
-            _chance(accepted.get((str(r["mechanism"]), place(r)), float(r["probability"]))),
-            f"{int(r['cluster'])}",
             mark="found" if (str(r["mechanism"]), place(r)) in accepted else "",
         )
         for r in shown.to_dict("records")
     ]
     columns = (
-        Column("what may be missing", kind="wide"), Column("gain", "nats, left out", "number"),
-        Column("runs better", "left out", "number"), Column("size", kind="number"),
-        Column("absorbed", "by recalibrating", "number"), Column("probability", kind="number"),
-        Column("cluster", kind="number"),
+        Column("what may be missing", kind="wide"), Column("probability", kind="number"), Column("size", kind="number"),
+        Column("gain", "nats, left out", "number"), Column("runs better", "left out", "number"),
+        Column("absorbed", "by recalibrating", "number"),
     )  # fmt: skip
-    notes = ["Candidates of one cluster look the same in these recordings.", *_dimensionless(rows, 3)]
+    notes = ["Explanations that these recordings cannot distinguish share their probability.", *_dimensionless(rows, 2)]
     if len(table) > len(shown):
         notes.append(f"Shown: the best {len(shown)} of {len(table)} that were refitted.")
-    return Table("Candidates, best first", columns, tuple(rows), simulated, notes=tuple(notes))
+    return Table("Explanations that were tried", columns, tuple(rows), notes=tuple(notes))
+
+
+_MOST_BARS = 6
+
+
+def explanations(x: Finding) -> list[tuple[str, float]]:
+    """A finding, its alternatives, nothing at all and no listed effect, with their probabilities."""
+    rows = [(effect_label(x), x.probability)]
+    rows += [(effect_label(o) + (" (not distinguishable)" if o.alike else ""), o.probability) for o in x.alternatives]
+    others = {"nothing is missing": "probability_nothing", "not in the library": "probability_unlisted"}
+    rows = rows[: _MOST_BARS - len(others)]
+    return rows + [(label, float(x.evidence[key])) for label, key in others.items() if x.evidence.get(key) is not None]
+
+
+def effect_label(x: Finding | Alternative) -> str:
+    """``heat to the floor at bed``, ``poorly bonded sensor: column_front``, ``bending of a column in the z error``."""
+    what, name = mechanism_label(x.mechanism), x.where.name
+    place = {"sensor": f": {name}", "error": f" in the {name} error", "link": f" at the link {name}"}
+    return what + place.get(x.where.kind, f" at {name}")
 
 
 def place(row: Mapping[Any, Any]) -> str:
@@ -222,26 +228,46 @@ def _chance(p: float) -> str:
     return probability_label(p) if math.isfinite(p) else NOTHING
 
 
-def runs(rms: pd.DataFrame, channels: Sequence[str], changed: bool, simulated: bool) -> Table:
-    """Left-out rms of every run (rows) and channel (columns, at most 10), before → after."""
-    shown = list(channels[:_MOST_CHANNELS])
-    unit = rms.drop_duplicates("channel").set_index("channel")["unit"]
-    at = {(r["batch"], r["channel"]): (float(r["before"]), float(r["after"])) for r in rms.to_dict("records")}
-    rows = []
+def runs(rms: pd.DataFrame, changed: bool) -> Table:
+    """Left-out rms of every run (rows) and channel (columns, the 10 that change most), before → after, and of all."""
+    channels = by_change(by_channel(rms))
+    shown = channels[:_MOST_CHANNELS].to_dict("records")
+    at = {(r["batch"], r["channel"]): r for r in rms.to_dict("records")}
+    rows = [Row.of("noise", *(number(c["floor"], digits_of(c["floor"])) for c in shown))]
+    rows.append(Row.of("all runs", *(_rms(c, changed) for c in shown), look="marked"))
     for batch in dict.fromkeys(rms["batch"]):
-        cells = []
-        for c in shown:
-            before, after = at.get((batch, c), (math.nan, math.nan))
-            digits = 1 if max(before, after) >= 0.95 else 2
-            cells.append(f"{number(before, digits)} → {number(after, digits)}" if changed else number(after, digits))
-        rows.append(Row.of(str(batch), *cells))
-    columns = (Column("run"), *(Column(c, unit_label(unit[c]), "number") for c in shown))
+        cells = (at.get((batch, c["channel"])) for c in shown)
+        rows.append(Row.of(str(batch), *(NOTHING if r is None else _rms(r, changed) for r in cells)))
+    columns = (Column("run"), *(Column(str(c["channel"]), unit_label(str(c["unit"])), "number") for c in shown))
     left = len(channels) - len(shown)
     notes = (f"Without {left} more channels, which change less.",) if left > 0 else ()
-    return Table("Left-out rms of every run", columns, tuple(rows), simulated, notes=notes)
+    return Table("Left-out rms", columns, tuple(rows), notes=notes)
 
 
-def steps(table: pd.DataFrame, simulated: bool) -> Table:
+def _rms(r: Mapping[Any, Any], changed: bool) -> str:
+    digits = digits_of(r["before"], r["after"])
+    after = number(r["after"], digits)
+    return f"{number(r['before'], digits)} → {after}" if changed else after
+
+
+_MOST_ERRORS, _TELLING = 3, 0.1  # a change by the noise floor
+
+
+def error_lines(rms: pd.DataFrame, changed: bool) -> tuple[str, ...]:
+    """``z 6.2 → 1.3 µm, noise 1.2 µm`` of the channels that change most; where nothing does, that differ most."""
+    if rms.empty:
+        return ()
+    ranked = by_change(by_channel(rms))
+    telling = ranked[ranked["change"] > _TELLING]
+    ranked = telling if changed and len(telling) else ranked
+    return tuple(
+        f"{r['channel']} {_rms(r, changed)} {unit_label(str(r['unit']))}, noise "
+        f"{number(r['floor'], digits_of(r['floor']))} {unit_label(str(r['unit']))}"
+        for r in ranked[:_MOST_ERRORS].to_dict("records")
+    )
+
+
+def steps(table: pd.DataFrame) -> Table:
     """The search, step by step."""
     rows = []
     for r in table.to_dict("records"):
@@ -254,63 +280,43 @@ def steps(table: pd.DataFrame, simulated: bool) -> Table:
         Column("threshold", "nats", "number"), Column("probability", kind="number"),
         Column("runs better", kind="number"), Column("verdict"),
     )  # fmt: skip
-    return Table("Steps of the search", columns, tuple(rows), simulated)
+    return Table("Steps of the search", columns, tuple(rows))
 
 
-def refinements(table: pd.DataFrame, simulated: bool) -> Table:
-    """What was made finer before any physics was named."""
-    rows = [
-        Row.of(str(r["what"]), str(r["why"]), _figure(r["before"]), _figure(r["after"]))
-        for r in table.to_dict("records")
-    ]
-    columns = (
-        Column("refined", kind="wide"), Column("why", kind="wide"),
-        Column("left-out log score before (nats)", kind="number"), Column("after", kind="number"),
-    )  # fmt: skip
-    notes = ("A network that is too coarse looks like missing physics, so it is refined first.",)
-    return Table("Refinements of the baseline", columns, tuple(rows), simulated, notes=notes)
-
-
-def _figure(value: Any) -> str:
-    return number(float(value), 2) if isinstance(value, int | float) else str(value)
-
-
-def limits(table: pd.DataFrame, simulated: bool) -> Table:
-    """The least effect that would be claimed, per candidate, and what hides it."""
+def limits(table: pd.DataFrame) -> Table:
+    """The least effect that would be claimed, of each mechanism at the place where that is least, and what hides it."""
+    own_best = table[table["limit"].notna()].drop_duplicates("mechanism")
     rows = []
-    for r in table.to_dict("records"):
+    for r in (own_best if len(own_best) else table)[:_MOST_LIMITS].to_dict("records"):
         limit, absorbed = _amplitude(r, "limit"), percent(float(r["absorbed"]))
         rows.append(Row.of(str(r["words"]), limit, absorbed, str(r["absorbed_by"] or NOTHING)))
     columns = (
         Column("effect", kind="wide"), Column("least that would be seen", kind="number"),
         Column("absorbed", "by recalibrating", "number"), Column("mostly by"),
     )  # fmt: skip
-    return Table("Detection limits", columns, tuple(rows), simulated, notes=tuple(_dimensionless(rows, 1)))
+    notes = ["A smaller effect may be there: these recordings would not show it.", *_dimensionless(rows, 1)]
+    if len(table) > len(rows):
+        notes.append("Of each mechanism the place where the least would be claimed; findings.json has all.")
+    return Table("Detection limits", columns, tuple(rows), notes=tuple(notes))
 
 
-def parameters(given: Mapping[str, FoundParameter], simulated: bool, caption: str) -> Table:
-    """Fitted values with their 90 % intervals."""
+def parameters(found: Sequence[Finding]) -> Table:
+    """Fitted values of all findings with their 90 % intervals."""
     rows = []
-    for name, p in given.items():
-        unit = unit_label(p.unit)
-        low, high = p.interval90 or (None, None)
-        interval = (
-            NOTHING if low is None or high is None else f"{three_digits(low)} to {three_digits(high)} {unit}".strip()
-        )
-        value = NOTHING if p.value is None else f"{three_digits(p.value)} {unit}".strip()
-        rows.append(Row.of(name.replace("_", " "), value, interval))
+    for k, x in enumerate(found, 1):
+        for name, p in x.parameters.items():
+            unit = unit_label(p.unit)
+            low, high = p.interval90 or (None, None)
+            interval = NOTHING
+            if low is not None and high is not None:
+                interval = f"{three_digits(low)} to {three_digits(high)} {unit}".strip()
+            value = NOTHING if p.value is None else f"{three_digits(p.value)} {unit}".strip()
+            rows.append(Row.of(f"{k}. {name.replace('_', ' ')}", value, interval))
     columns = (Column("parameter"), Column("value", kind="number"), Column("90 % interval", kind="number"))
-    return Table(caption, columns, tuple(rows), simulated)
-
-
-def windows(finding: Finding, label: str, simulated: bool) -> Table:
-    """In which stretches of which runs a finding shows."""
-    rows = [Row.of(batch, between(start_s, end_s)) for batch, start_s, end_s in finding.when.windows]
-    return Table(f"{label}: windows", (Column("run"), Column("from, to", "h:min of the run")), tuple(rows), simulated)
+    return Table("Parameters of the findings", columns, tuple(rows))
 
 
 CHANCE = 0.001  # a place is coloured where chance gives as much in fewer cases than this
-SEEN_Z = 2.0  # a cell of where × when below it is pale
 
 
 def by_channel(rms: pd.DataFrame) -> pd.DataFrame:
@@ -340,23 +346,15 @@ def by_change(channels: pd.DataFrame) -> pd.DataFrame:
     return ranked.sort_values(["kelvin", "change"], ascending=[True, False], kind="stable").drop(columns="kelvin")
 
 
-def telling(rms: pd.DataFrame, changed: bool, most: int = 3) -> list[tuple[str, str]]:
-    """Batches worth drawing, each with the reason: the greatest change (or error) and the one of median change."""
-    if rms.empty:
-        return []
+def most_changed(rms: pd.DataFrame, changed: bool) -> str:
+    """The batch of the greatest change by the noise floor (without a change: of the greatest error)."""
     size = (rms["before"] - rms["after"] if changed else rms["before"]) / rms["floor"].replace(0.0, np.nan)
-    of_batch = size.groupby(rms["batch"], sort=False).mean().fillna(0.0).sort_values(ascending=False, kind="stable")
-    what = "change" if changed else "error"
-    names = [str(b) for b in of_batch.index]
-    great = names[: max(min(most - 1, len(names) - 1), 1)]
-    reasons = [f"greatest {what}", f"second greatest {what}", f"third greatest {what}"]
-    chosen = list(zip(great, reasons, strict=False))
-    typical = names[len(names) // 2]
-    return chosen if typical in great else [*chosen, (typical, f"typical, median {what}")]
+    of_batch = size.groupby(rms["batch"], sort=False).mean().fillna(0.0)
+    return str(of_batch.idxmax())
 
 
-def chosen_channels(channels: pd.DataFrame, changed: bool, most: int = 4) -> list[str]:
-    """Two to four channels that change most (without a change: that differ most), one displacement at least."""
+def chosen_channels(channels: pd.DataFrame, changed: bool, most: int = 3) -> list[str]:
+    """Two or three channels that change most (without a change: that differ most), one displacement at least."""
     size = (channels["before"] - channels["after"] if changed else channels["before"]) / channels["floor"]
     ranked = channels.assign(size=size.fillna(0.0)).sort_values("size", ascending=False, kind="stable")
     strong = ranked[ranked["size"] > 0.1 * ranked["size"].max()] if len(ranked) else ranked
@@ -385,20 +383,7 @@ def mismatch(where: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(out, columns=["kind", "place", "unit", "size", "mean", "shown"])
 
 
-def strongest(where: pd.DataFrame, kind: str, most: int) -> list[str]:
-    """Places of a kind by their greatest |z|, at most `most`, in the table's order."""
-    own = where[where["kind"] == kind]
-    z = own["z"].abs().groupby(own["place"], sort=False).max().sort_values(ascending=False, kind="stable")
-    chosen = set(z.index[:most])
-    return [str(p) for p in dict.fromkeys(own["place"]) if p in chosen]
-
-
-def ordered(where: pd.DataFrame, by: str) -> list[str]:
-    """Labels of a group in the table's order."""
-    return [str(x) for x in dict.fromkeys(where[where["by"] == by]["label"])]
-
-
-def account_table(account: Mapping[str, Any], simulated: bool) -> Table | None:
+def account_table(account: Mapping[str, Any]) -> Table | None:
     """A row for each batch, channel and check that took values away; `account` as `data.account.Account.as_dict`."""
     if not account.get("lost"):
         return None
@@ -413,4 +398,4 @@ def account_table(account: Mapping[str, Any], simulated: bool) -> Table | None:
         Column("batch"), Column("channel"), Column("check"), Column("state"), Column("rows", "", "number"),
         Column("of the batch", "%", "number"), Column("between", "h", "number"),
     )  # fmt: skip
-    return Table("Values that are not used", columns, rows, simulated)
+    return Table("Values that are not used", columns, rows)

@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
 from diagnosis.contracts import COLUMNS
-from reports.diagnosis import figures as diagnosis_evidence
 from reports.diagnosis import figures as diagnosis_figures
 from reports.diagnosis import tables as diagnosis_extracts
 from reports.diagnosis.map import Mark, mismatch_picture
@@ -46,14 +45,12 @@ def test_channels_are_summed_over_all_rows() -> None:
     assert np.isnan(t["before"]) and t["improved"] == 0
 
 
-def test_the_most_changed_and_a_typical_run_are_drawn() -> None:
-    gains = {"a": 1.0, "b": 9.0, "c": 3.0, "d": 5.0, "e": 2.0}
+def test_the_most_changed_run_is_drawn() -> None:
+    gains = {"a": 1.0, "b": 9.0, "c": 3.0}
     rms = pd.DataFrame([(b, "z", "um", 9, 10.0, 10.0 - g, 1.0) for b, g in gains.items()], columns=list(COLUMNS["rms"]))
-    assert diagnosis_extracts.telling(rms, True) == [
-        ("b", "greatest change"), ("d", "second greatest change"), ("c", "typical, median change"),
-    ]  # fmt: skip
-    assert diagnosis_extracts.telling(rms[:1], True) == [("a", "greatest change")]
-    assert diagnosis_extracts.telling(rms[:0], True) == []
+    assert diagnosis_extracts.most_changed(rms, True) == "b"
+    rms.loc[2, "before"] = 12.0
+    assert diagnosis_extracts.most_changed(rms, False) == "c"
 
 
 def test_a_place_is_shown_only_beyond_chance() -> None:
@@ -96,65 +93,32 @@ def test_a_machine_without_mismatch_says_so(view: Overview) -> None:
     assert "no unexplained heat" in said and "SIMULATED" not in said and not any(" W" in t for t in said)
 
 
-def test_before_and_after_are_numbers_with_units() -> None:
-    d = toy_diagnosis("explained")
-    channels = diagnosis_extracts.by_change(diagnosis_extracts.by_channel(d.tables["rms"]))
-    said = texts(diagnosis_figures.before_after(channels, True, True))
-    z = channels.iloc[0]
-    assert z["channel"] == "z" and f"{z['before']:.1f} → {z['after']:.1f}" in said
-    assert {"rms, µm", "rms, K", "noise floor", "before", "after", "SIMULATED"} <= set(said)
-    alone = texts(diagnosis_figures.before_after(channels, False, False))
-    assert "simulation" in alone and "before" not in alone and "SIMULATED" not in alone
-
-
-def test_left_out_runs_show_three_lines_and_why_they_were_chosen() -> None:
+def test_a_left_out_run_shows_three_lines_and_the_rms_of_both_simulations() -> None:
     t = toy_diagnosis("explained").tables
-    runs = diagnosis_extracts.telling(t["rms"], True)
-    fig = diagnosis_figures.left_out_batches(t["series"], t["rms"], runs, ["z", "bed"], True, True)
-    assert len(fig.axes) == 6 and all(len(ax.lines) == 3 for ax in fig.axes)
+    own, scores = (x[(x["batch"] == BATCHES[0]) & (x["channel"] == "bed")] for x in (t["series"], t["rms"]))
+    fig = diagnosis_figures.left_out_run(own, scores, "bed", True, True)
+    before, after, recorded = fig.axes[0].lines
+    assert np.array_equal(before.get_ydata(), own["before"]) and np.array_equal(after.get_ydata(), own["after"])
+    assert np.array_equal(recorded.get_ydata(), own["recorded"], equal_nan=True)
     said = texts(fig)
-    assert {"greatest change", "typical, median change", "z, µm", "bed, °C", "time, h"} <= set(said)
-    assert any(re.fullmatch(r"rms \d\.\d\d → \d\.\d\d K", s) for s in said)
-    plain = diagnosis_figures.left_out_batches(t["series"], t["rms"], runs, ["z"], False, True)
-    assert all(len(ax.lines) == 2 for ax in plain.axes)
+    assert {"bed, °C", "SIMULATED"} <= set(said) and any(re.fullmatch(r"rms \d\.\d\d → \d\.\d\d K", s) for s in said)
+    plain = diagnosis_figures.left_out_run(own, scores, "bed", False, False)
+    assert len(plain.axes[0].lines) == 2 and "SIMULATED" not in texts(plain) and not any("→" in s for s in texts(plain))
 
 
-def test_where_and_when_is_pale_within_chance() -> None:
-    rows = [("heat", place, "batch", label, value, "W", z) for place, label, value, z in (
-        ("bed", "b1", 60.0, 9.0), ("bed", "b2", 60.0, 1.0), ("table", "b1", -60.0, -9.0),
-    )]  # fmt: skip
-    fig = diagnosis_evidence.where_when(pd.DataFrame(rows, columns=list(COLUMNS["map"])), ("regime", "batch"), False)
-    cells = fig.axes[0].images[0].get_array()
-    assert cells is not None and cells.shape[:2] == (2, 2)
-    cells = np.asarray(cells)
-    strong, pale, blue, none = cells[0, 0], cells[0, 1], cells[1, 0], cells[1, 1]
-    assert strong[0] > 1.5 * strong[2] and pale[:3].min() > 0.8 and blue[2] > 1.5 * blue[0]
-    assert none[:3] == pytest.approx([0.91, 0.93, 0.95])
-    assert {"by run", "unexplained heat", "bed", "W"} <= set(texts(fig))
+def test_a_bar_is_as_long_as_its_probability() -> None:
+    fig = diagnosis_figures.probabilities([("heat $1$", 0.7, "70 %"), ("nothing is missing", 0.2, "20 %")], "f", True)
+    (ax,) = fig.axes
+    assert [p.get_width() for p in ax.patches] == [1, 0.7, 1, 0.2]
+    assert {"heat \\$1\\$", "70 %", "nothing is missing", "20 %", "SIMULATED"} <= set(texts(fig))
 
 
-def test_a_missing_flux_shows_its_band_on_one_scale() -> None:
-    t = toy_diagnosis("unlisted").tables
-    fig = diagnosis_evidence.missing_flux(t["flux"], True)
-    assert len(fig.axes) == 6 and {"column_back, W", BATCHES[5], "time, h"} <= set(texts(fig))
-    band = fig.axes[0].collections[0].get_paths()[0].get_extents()
-    assert band.y1 > float(t["flux"]["value"][:73].max()) + 8 and fig.axes[0].get_ylim() == fig.axes[5].get_ylim()
-
-
-def test_names_with_dollars_and_many_runs_are_drawn() -> None:
+def test_names_with_dollars_are_drawn() -> None:
     t = toy_diagnosis("explained").tables
-    odd = {k: t[k].assign(channel=t[k]["channel"].replace({"z": "z$1$"})) for k in ("rms", "series", "acf")}
-    channels = diagnosis_extracts.by_change(diagnosis_extracts.by_channel(odd["rms"]))
-    runs = pd.concat([odd["rms"].assign(batch=odd["rms"]["batch"] + f"_{k}") for k in range(4)])
-    figures = [
-        diagnosis_figures.before_after(channels, True, True),
-        diagnosis_figures.by_run(runs, ["z$1$", "bed"], True, True),
-        diagnosis_evidence.autocorrelation(odd["acf"], True, True),
-    ]
-    for figure in figures:
-        figure.savefig(io.BytesIO(), format="svg")
-        assert any("z\\$1\\$" in s for s in texts(figure))
-    assert len(figures[1].axes[0].get_yticks()) == 30
+    own, scores = (x[(x["batch"] == BATCHES[0]) & (x["channel"] == "z")] for x in (t["series"], t["rms"]))
+    figure = diagnosis_figures.left_out_run(own, scores, "z$1$", True, True)
+    figure.savefig(io.BytesIO(), format="svg")
+    assert any("z\\$1\\$" in s for s in texts(figure))
 
 
 def test_many_sensors_of_a_body_fit_its_box(view: Overview) -> None:
@@ -173,4 +137,4 @@ def test_many_sensors_of_a_body_fit_its_box(view: Overview) -> None:
 def test_a_displacement_is_always_among_the_drawn_channels() -> None:
     rows = [("a", f"t{k}", "K", 9, 5.0, 0.1, 0.1) for k in range(6)] + [("a", "z", "um", 9, 2.0, 1.0, 1.0)]
     channels = diagnosis_extracts.by_channel(pd.DataFrame(rows, columns=list(COLUMNS["rms"])))
-    assert diagnosis_extracts.chosen_channels(channels, True) == ["z", "t0", "t1", "t2"]
+    assert diagnosis_extracts.chosen_channels(channels, True) == ["z", "t0", "t1"]

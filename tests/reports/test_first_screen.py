@@ -11,8 +11,9 @@ from typing import Any, get_args
 import pytest
 
 from diagnosis.findings.schema import DetectionLimit, Finding, Place
-from reports.diagnosis.first_screen import Outcome, Unsealed, effect_label, limits_sentence, shortened, values_label
+from reports.diagnosis.first_screen import Outcome, Unsealed, limits_sentence, shortened, values_label
 from reports.diagnosis.page import diagnosis_page, write_diagnosis_report
+from reports.diagnosis.tables import effect_label
 from reports.layout import Text
 from tests.reports.test_report_browser import CHROMIUM, FRAME, open_page
 from tests.toys.diagnosis import toy_diagnosis
@@ -119,7 +120,7 @@ def test_consistent_states_what_would_have_been_seen_in_the_errors_unit() -> Non
 
 MEASURE = """<script>addEventListener("load", () => {
   const panel = document.querySelector(".unsealed").getBoundingClientRect()
-  const wide = [...document.querySelectorAll(".unsealed *, .figures *")].filter(
+  const wide = [...document.querySelectorAll(".unsealed *, header.top *")].filter(
     e => e.getBoundingClientRect().right > innerWidth).map(e => e.textContent)
   const errors = document.querySelector(".three").getBoundingClientRect().bottom
   const badge = document.querySelector(".unsealed .badge").getBoundingClientRect().width
