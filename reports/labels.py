@@ -7,8 +7,6 @@ from collections.abc import Sequence
 
 # Okabe & Ito 2008, safe for the colour-blind; yellow, unreadable on white, replaced by olive.
 INK, BLUE, ORANGE, GREEN = "#1f2933", "#0072b2", "#d55e00", "#00755a"
-_PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7d6608", "#4b3f72")
-_SYMBOLS = ("circle", "square", "diamond", "triangle-up")
 NOTHING = "–"
 _HUGE = 10_000.0
 
@@ -39,12 +37,6 @@ def cell_label(selector: str, family: str, n_tsp: int) -> str:
     if selector in ("none", family):  # a stack's members bring their own points
         return f"{family_label(family)} on all {n_tsp} points"
     return f"{family_label(family)} on {count(n_tsp, 'point')} by {selector_label(selector)}"
-
-
-def styles(keys: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Colour and marker of each of the families of a figure; eight of them differ in colour."""
-    n, m = len(_PALETTE), len(_SYMBOLS)
-    return {key: (_PALETTE[i % n], _SYMBOLS[(i + i // n) % m]) for i, key in enumerate(dict.fromkeys(keys))}
 
 
 def tex_escaped(name: str) -> str:

@@ -143,7 +143,7 @@ class Key:
 
     label: str
     color: str
-    symbol: str = "line"  # line, dot, dash, dashdot; circle, square, diamond, triangle-up on a line
+    symbol: str = "line"  # line, dot, dash; circle, square, diamond, triangle-up on a line
     alone: bool = False  # the symbol without a line
 
 
@@ -228,7 +228,7 @@ class Pairs:
     """Labels with their values; a value of several lines is a tuple of texts."""
 
     entries: tuple[tuple[str, str | tuple[Text, ...]], ...]
-    look: str = "facts"  # facts, facts compact, facts quiet, pairs, glossary, three
+    look: str = "facts"  # facts, pairs, glossary, three
 
 
 @dataclass(frozen=True)

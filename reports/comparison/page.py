@@ -121,7 +121,7 @@ def _grouped(trainings: Sequence[Training]) -> list[list[Training]]:
 
 
 def _name(training: Training, several: bool, mixed: bool) -> str:
-    """The channel, with its machine where there are several; SIMULATED where that is not so of the whole page."""
+    """The channel, with its machine where there are several; SIMULATED where not the whole page is."""
     name = f"{training.result.machine} {training.result.target}" if several else training.result.target
     return f"{name} (SIMULATED)" if mixed and _simulated(training) else name
 

@@ -64,12 +64,6 @@ def is_baseline(cells: pd.DataFrame) -> pd.Series:
     return cells["family"].isin(BASELINES)
 
 
-def zero_um(cells: pd.DataFrame) -> float:
-    """S_mean without a model, NaN where it was not run."""
-    zero = cells.loc[cells["family"] == "zero", "S_mean_um"]
-    return float(zero.iloc[0]) if len(zero) else float("nan")
-
-
 def left_out_batches(result: GridResult, choice: Choice) -> list[LeftOut]:
     """Every left-out batch of a cell by S, the median and the worst by name; empty where no prediction was kept.
 

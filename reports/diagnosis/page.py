@@ -127,7 +127,7 @@ def _pictures(d: Diagnosis) -> Iterator[Any]:
             Mark(f"{k} {_short(x.mechanism)}", x.where.kind, x.where.name) for k, x in enumerate(d.findings.findings, 1)
         ]
         figure = mismatch_picture(view, mismatch(t["map"]), marks)
-        yield picture(figure, "The machine with the mismatch coloured in", d.simulated, "svg", "network")
+        yield picture(figure, "The machine with the mismatch coloured in", d.simulated, "svg", "network full")
         yield Text("Coloured is what chance gives in fewer than 1 of 1000 cases (χ² of the runs' z).", "note")
     if len(t["series"]) and len(t["rms"]):
         yield _run(t["series"], t["rms"], changed, d.simulated)

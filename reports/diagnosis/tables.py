@@ -113,11 +113,6 @@ def below_headline(verdict: str, runs: int, limits: int) -> str:
     return text + ("; an effect above the limits below would be claimed." if limits else ".")
 
 
-def place_label(kind: str, name: str) -> str:
-    """``bed``, ``link bed-floor``, ``sensor z1``, ``error z``."""
-    return name if kind == "node" else f"{kind} {name}"
-
-
 def mechanism_label(key: str) -> str:
     """A mechanism's name for engineers, from the registry; alternatives that are no mechanism have their own."""
     from twin.mechanisms import MECHANISMS

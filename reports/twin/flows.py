@@ -3,34 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap, Normalize, to_hex
+from matplotlib.colors import LinearSegmentedColormap, to_hex
 from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch
 
 from data.arrays import Array
 from reports.drawing import MUTED, WIDTH_IN, calm, head
 from reports.labels import INK, number, tex_escaped
-from reports.twin.glyphs import LINK, SOFT, arrow, ground, say, width_in
 from reports.twin.network_picture import (
-    SIDE_IN,
-    TEXT_PT,
-    Body,
-    Stub,
+    LINK,
+    Card,
+    Drawn,
+    Lines,
     arranged,
-    draw,
-    given_to,
-    ground_color,
-    grown,
-    label_lines,
-    placed,
-    segments,
-    shortened,
-    title,
+    heat_lines,
+    is_shared,
+    watts_label,
 )
 from twin.views.heat_flows import HeatFlows
-from twin.views.overview import BodyView, Overview, Tie
+from twin.views.overview import Overview, Tie
 
 _HEATS = LinearSegmentedColormap.from_list("heats", ["#7a2e00", "#d55e00", "#f0a35e", "#f8d9b8"])
 _STORES = LinearSegmentedColormap.from_list("stores", ["#0b4f7d", "#3b8cc4", "#8fc1e3", "#d3e6f3"])
@@ -109,110 +104,59 @@ def _entries(fig: Figure, entries: Sequence[tuple[str, str, float]]) -> None:
 
 
 WARMTH = LinearSegmentedColormap.from_list("warmth", ["#8ec3e6", "#f4f7fa", "#fbd9bd", "#f0a266", "#e27a35"])
-_LEGEND_IN, _LEAST_W = 0.72, 0.5
+_LEAST_W = 0.5
 
 
 def flow_picture(view: Overview, flows: HeatFlows, time_s: float) -> Figure:
     """Flows in the interval that `time_s` lies in, rises at its end; nothing is drawn for less than half a watt."""
     k = int(np.clip(np.searchsorted(flows.time_s, time_s, side="right") - 1, 0, len(flows.dt_s) - 1))
-    links = [t for t in view.ties if not t.ground]
-    most = max([abs(float(flows.link_W[t.name][k])) for t in view.ties] or [1.0]) or 1.0
     rises = [float(r[k + 1]) for r in flows.rise_K.values()]
-    warmth = _warmth(rises)
-    fig, ax, bodies = arranged(view, [_body(view, b, flows, k, warmth, most) for b in view.bodies], _LEGEND_IN)
-    lines = segments(links, bodies, 0.03)
-    watts = [float(flows.link_W[t.name][k]) for t in links]
-    for w, (a, b) in zip(watts, lines, strict=True):
-        if abs(w) < _LEAST_W:
-            ax.plot([a[0], b[0]], [a[1], b[1]], color="#cdd4db", lw=1.0, zorder=1)
-        else:
-            arrow(ax, *((a, b) if w > 0 else (b, a)), LINK, _width_pt(w, most), zorder=1)
-    bodies = placed(bodies, lines)
-    label_lines(ax, [_watts(abs(w)) if abs(w) >= _LEAST_W else "" for w in watts], lines, bodies, INK)
-    for body in bodies:
-        draw(ax, body)
-    _legend(ax, view, warmth, most)
+    # white at no rise; the cold half shows only where something cooled
+    top = max(max(rises, default=0.0), -2.0 * min(rises, default=0.0), 0.5)
+    fills = {b: to_hex(WARMTH(0.75 * (float(r[k + 1]) / top + 1 / 3))) for b, r in flows.rise_K.items()}
+    cards = [Card(b.name, _lines(view, b.name, flows, k), fills[b.name], is_shared(view, b.name)) for b in view.bodies]
     minutes = round(float(flows.time_s[k + 1]) / 60)
-    label = f"{flows.batch_id} at {minutes // 60}:{minutes % 60:02d} h: heat through {view.machine}"
     put_in, stored = (sum(float(w[k]) for w in f.values()) for f in (flows.heat_W, flows.storage_W))
     gone = sum(float(w[k]) for w in flows.loss_W.values())
-    below = f"{number(put_in, 0)} W put in, {number(stored, 0)} W stored, {number(gone, 0)} W to the surroundings"
-    title(ax, label, below, flows.simulated)
-    return fig
+    drawn = arranged(
+        view, cards,
+        [f"Arrows: heat through links. + : heat put in. → : given off. Colour: rise up to {number(top, 1)} K."],
+        f"{flows.batch_id} at {minutes // 60}:{minutes % 60:02d} h: heat through {view.machine}",
+        f"{number(put_in, 0)} W put in, {number(stored, 0)} W stored, {number(gone, 0)} W to the surroundings",
+    )  # fmt: skip
+    links = [t for t in view.ties if not t.ground]
+    most = max([abs(float(flows.link_W[t.name][k])) for t in links] or [1.0]) or 1.0
+    for t in links:
+        watts = float(flows.link_W[t.name][k])
+        _arrow(drawn, t if watts > 0 else replace(t, ends=t.ends[::-1]), abs(watts), most)
+    return drawn.figure
 
 
-def _warmth(rises: Sequence[float]) -> Normalize:
-    """White at no rise, as warm as the greatest rise or fall; the cold half shows only where something cooled."""
-    top = max(max(rises, default=0.0), -2.0 * min(rises, default=0.0), 0.5)
-    return Normalize(-top / 3, top)
-
-
-def _color(rise_K: float, warmth: Normalize) -> str:
-    return to_hex(WARMTH(float(warmth(rise_K))))
-
-
-def _body(view: Overview, b: BodyView, flows: HeatFlows, k: int, warmth: Normalize, most: float) -> Body:
-    rise, stored = float(flows.rise_K[b.name][k + 1]), float(flows.storage_W[b.name][k])
-    lines = [
-        (f"{number(rise, 1, sign=True)} K", INK),
-        (f"{'stores' if stored >= 0 else 'gives'} {_watts(abs(stored))}", INK),
-    ]
-    return Body(
-        b.name,
-        tuple(lines),
-        grown(view, b),
-        (),
-        shortened(_heats(view, b.name, flows, k)),
-        tuple(
-            _stub(view, t, float(flows.link_W[t.name][k]), most) for t in view.ties if t.ground and t.ends[0] == b.name
-        ),
-        _color(rise, warmth),
-        ground_color(view, b.name) if given_to(view, b.name) else "",
-    )
-
-
-def _heats(view: Overview, body: str, flows: HeatFlows, k: int) -> list[str]:
-    """A body's share of every law's watts at the moment."""
-    out = []
-    for h in view.heats:
+def _lines(view: Overview, body: str, flows: HeatFlows, k: int) -> Lines:
+    """A body's rise, what it stores, its share of every law's watts, and what it gives to surroundings."""
+    stored = float(flows.storage_W[body][k])
+    lines = [(f"{number(float(flows.rise_K[body][k + 1]), 1, sign=True)} K", INK)]
+    lines.append((f"{'stores' if stored >= 0 else 'gives'} {watts_label(abs(stored))}", INK))
+    heats = []
+    for h in (h for h in view.heats if h.body == body):
         total = sum(x.share for x in view.heats if x.law == h.law)
         watts = float(flows.heat_W[h.law][k]) * h.share / total if abs(total) > 1e-9 else 0.0
-        if h.body == body and abs(watts) >= _LEAST_W:
-            out.append(f"{h.law}  {_watts(watts)}")
-    return out
+        heats += [f"{h.law} {watts_label(watts)}"] if abs(watts) >= _LEAST_W else []
+    own = [(t.ends[1], float(flows.link_W[t.name][k])) for t in view.ties if t.ground and t.ends[0] == body]
+    return (*lines, *heat_lines(heats, INK), *((f"→ {to} {watts_label(watts)}", INK) for to, watts in own))
 
 
-def _stub(view: Overview, t: Tie, watts: float, most: float) -> Stub:
-    to = t.ends[1]
-    width = min(_width_pt(watts, most), 5.0) if abs(watts) >= _LEAST_W else 0.8
-    return Stub(f"{to} {_watts(watts)}", ground_color(view, to), width, any(b.name == to for b in view.bodies))
-
-
-def _watts(watts: float) -> str:
-    return f"{number(watts, 0 if abs(watts) >= 9.5 else 1)} W"
-
-
-def _width_pt(watts: float, most: float) -> float:
-    return 1.0 + 6.0 * abs(watts) / most
-
-
-def _legend(ax: Axes, view: Overview, warmth: Normalize, most: float) -> None:
-    y, x = 0.36, SIDE_IN + 0.05
-    ax.plot([SIDE_IN, ax.get_xlim()[1] - SIDE_IN], [y + 0.3] * 2, color="#d5dbe1", lw=0.8)
-    for w in (0.1 * most, 0.5 * most, most):
-        arrow(ax, (x, y), (x + 0.42, y), LINK, _width_pt(w, most))
-        say(ax, (x + 0.5, y), _watts(w), TEXT_PT, SOFT, ha="left")
-        x += 0.68 + width_in(_watts(w), TEXT_PT)
-    low, high = float(warmth.vmin or 0.0), float(warmth.vmax or 1.0)
-    for i in range(41):
-        rise = low + i * (high - low) / 40
-        ax.plot([x + 0.035 * i] * 2, [y - 0.07, y + 0.07], color=_color(rise, warmth), lw=3.0, solid_capstyle="butt")
-    label = f"rise {number(low, 1)} to {number(high, 1)} K"
-    say(ax, (x + 1.52, y), label, TEXT_PT, SOFT, ha="left")
-    x += 1.75 + width_in(label, TEXT_PT)
-    names = list(dict.fromkeys(t.ends[1] for t in view.ties if t.ground))
-    for name in names:
-        ring = any(b.name == name for b in view.bodies)
-        ground(ax, (x + 0.05, y + 0.1), ground_color(view, name), 2.0, 0.09, ring)
-        say(ax, (x + 0.22, y), f"to {name}", TEXT_PT, ground_color(view, name), ha="left")
-        x += 0.42 + width_in(f"to {name}", TEXT_PT)
+def _arrow(drawn: Drawn, t: Tie, watts: float, most_W: float) -> None:
+    """From the first body of a link to the second, as wide as its watts; a thin line where nearly nothing flows."""
+    a, b = t.ends
+    if watts < _LEAST_W:
+        drawn.ax.plot(*zip(drawn.middle(a), drawn.middle(b), strict=True), color="#cdd4db", lw=1.0, zorder=1)
+        return
+    width = 1.0 + 6.0 * watts / most_W
+    drawn.ax.add_patch(
+        FancyArrowPatch(
+            drawn.middle(a), drawn.middle(b), arrowstyle="-|>", mutation_scale=7.0 + 2.2 * width, color=LINK, lw=width,
+            patchA=drawn.cards[a], patchB=drawn.cards[b], shrinkA=2, shrinkB=2, zorder=1, joinstyle="miter",
+        )
+    )  # fmt: skip
+    drawn.label(t, watts_label(watts), INK)

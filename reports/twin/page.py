@@ -117,7 +117,7 @@ def _network(data: TwinData, pictures: bool) -> Section:
     shown = []
     if pictures:
         label, simulated = "Thermal network and error chains", data.view.simulated
-        shown.append(picture(network_picture(data.view), label, simulated, "svg", "network"))
+        shown.append(picture(network_picture(data.view), label, simulated, "svg", "network full"))
     return Section("network", "Network", (*shown, tables.bodies(data.view)))
 
 
@@ -165,7 +165,7 @@ def _heat(data: TwinData, most: int, pictures: bool) -> Section:
         moment = min(_HOUR_S, 0.5 * float(f.time_s[-1]))
         blocks.append(picture(heat_stack(f), f"{f.batch_id}: where the watts go", f.simulated, look="full"))
         label = f"{f.batch_id}: heat through the network"
-        blocks.append(picture(flow_picture(data.view, f, moment), label, f.simulated, "svg", "network"))
+        blocks.append(picture(flow_picture(data.view, f, moment), label, f.simulated, "svg", "network full"))
     return Section("heat", "Where the watts go", tuple(blocks))
 
 

@@ -17,8 +17,7 @@ from data.errors import InputError
 from reports.drawing import picture_bytes
 from reports.twin.figures import fit_figure, mode_shapes, residual_map, rms_map
 from reports.twin.flows import flow_picture, heat_stack
-from reports.twin.glyphs import Rect
-from reports.twin.network_picture import PITCH_IN, by_length, network_picture, shortened
+from reports.twin.network_picture import chain_label, heat_lines, network_picture, sensor_lines
 from reports.twin.page import write_picture
 from tests.reports.toy_twin import batch, flows
 from twin.views.compared import rms_table
@@ -50,58 +49,54 @@ def test_every_body_link_surrounding_sensor_and_law_is_in_the_picture(view: Over
         assert b.name in said
     for t in view.ties:
         g = f"{t.conductance_W_per_K:.3g}"
-        assert (f"{t.ends[1]} {g}" if t.ground else g) in said
-    assert "bed" in said and "1100 kJ/K" in said and "◆ head_front" in said and "motor_loss  149 W" in said
-    assert "room: recorded as room" in said and "air: enclosure air with its sheet metal" in said
-    assert "heat, steady state, spindle_rpm = 4000, surroundings at 20 °C" in said
+        assert (f"→ {t.ends[1]} {g}" if t.ground else g) in said
+    assert {"1100 kJ/K", "◆ head_front", "+ motor_loss 149 W", "z +, y +", "SIMULATED"} <= set(said)
+    assert "room: recorded as room" in said
+    assert any("heat, steady state, spindle_rpm = 4000, surroundings at 20 °C" in s for s in said)
     assert "14 bodies, 16 links, 17 exposures, 9 sensors; 60 free and 81 fixed parameters" in said
-    assert "SIMULATED" in said
 
 
-def test_chains_are_told_with_sign_and_closure(view: Overview, picture: Figure) -> None:
-    said = texts(picture)
-    assert said.count("closes: both sides are equal") == 3
-    assert "tilt −12.15 µm/K × (column_front − column_back)" in said and "and speed_shift" in said
-    assert "column_back 0.625" in said and "Error chains, lengths in m" in said
-    assert {"z +", "z −", "y +", "y −", "x +", "x −"} <= set(said)
-    assert by_length(view.chains)
-
-
-def test_boxes_neither_overlap_nor_leave_the_paper_and_grow_with_capacity(view: Overview, picture: Figure) -> None:
-    ax = picture.axes[0]
-    boxes = [p for p in ax.patches if isinstance(p, FancyBboxPatch) and p.get_height() > 0.25]
-    rects = [
-        Rect(p.get_x() + p.get_width() / 2, p.get_y() + p.get_height() / 2, p.get_width() + 0.12, p.get_height() + 0.12)
-        for p in boxes
-    ]
-    assert len(rects) == len(view.bodies)
-    for i, one in enumerate(rects):
-        assert one.x - one.w / 2 > 0 and one.x + one.w / 2 < ax.get_xlim()[1]
-        assert all(one.overlap(other) == 0 for other in rects[:i])
-    by_capacity = sorted(zip([b.capacity_J_per_K for b in view.bodies], [r.w * r.h for r in rects], strict=True))
-    sizes = [size for _, size in by_capacity]
-    assert sizes == sorted(sizes) and sizes[-1] > 1.5 * sizes[0]
+def test_chains_are_told_with_sign_and_closure(view: Overview) -> None:
+    z, y, _ = (chain_label(c) for c in view.chains)
+    assert z.startswith("z: + ") and "− column_back 0.625 m, closes" in z
+    assert z.endswith("; tilt −12.15 µm/K × (column_front − column_back); speed_shift")
+    assert y.endswith("bed 0.25 − table 0.2 m, closes; tilt −16.88 µm/K × (column_front − column_back)")
+    unknown = replace(view.chains[0], parts=(("bed", float("nan"), 2.5),), tilts=(), also=())
+    assert chain_label(unknown) == "z: + bed 2.5 µm/K"
 
 
 @pytest.mark.parametrize("scaled", [False, True])
-def test_words_keep_clear_of_boxes_and_of_each_other(view: Overview, picture: Figure, scaled: bool) -> None:
+def test_cards_and_labels_keep_clear_of_each_other_and_on_the_paper(view: Overview, scaled: bool) -> None:
     """Also where other conductances make another layout."""
     if scaled:
         ties = [
             replace(t, conductance_W_per_K=t.conductance_W_per_K * 1.8 ** (k % 3 - 1)) for k, t in enumerate(view.ties)
         ]
-        picture = network_picture(replace(view, ties=tuple(ties)))
+        view = replace(view, ties=tuple(ties))
+    figure = network_picture(view)
+    ax = figure.axes[0]
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    cards = [p.get_window_extent(renderer) for p in ax.patches if isinstance(p, FancyBboxPatch)]
+    assert len(cards) == len(view.bodies)
+    for k, card in enumerate(cards):
+        assert figure.bbox.containsx(card.x0) and figure.bbox.containsx(card.x1)
+        assert not any(card.overlaps(other) for other in cards[:k])
+    labels = [t for t in ax.texts if re.fullmatch(r"[\d.]+", t.get_text())]
+    assert len(labels) == sum(not t.ground for t in view.ties)
+    for label in labels:
+        at = label.get_window_extent(renderer).shrunk(0.9, 0.9)
+        assert not any(at.overlaps(card) for card in cards), label.get_text()
+
+
+def test_every_line_of_a_card_is_inside_it(view: Overview, picture: Figure) -> None:
     ax = picture.axes[0]
     renderer = FigureCanvasAgg(picture).get_renderer()
-    boxes = [
-        p.get_window_extent(renderer) for p in ax.patches if isinstance(p, FancyBboxPatch) and p.get_height() > 0.25
-    ]
-    outside = [t for t in ax.texts if re.fullmatch(r"(room|air|floor) [\d.]+|\w+  [\d.]+ W", t.get_text())]
-    assert len(outside) == 17 + 11
-    places = [(t.get_text(), t.get_window_extent(renderer)) for t in outside]
-    for k, (text, at) in enumerate(places):
-        assert not any(at.overlaps(b) for b in boxes), text
-        assert not [other for other, there in places[:k] if at.shrunk(0.9, 0.9).overlaps(there)], text
+    cards = [p.get_window_extent(renderer) for p in ax.patches if isinstance(p, FancyBboxPatch)]
+    names = {b.name for b in view.bodies}
+    for t in ax.texts:
+        text, at = t.get_text(), t.get_window_extent(renderer)
+        if text in names or text[:2] in ("→ ", "◆ ", "+ "):
+            assert any(c.x0 <= at.x0 and at.x1 <= c.x1 and c.y0 <= at.y0 and at.y1 <= c.y1 for c in cards), text
 
 
 def test_the_picture_is_the_same_every_time(view: Overview, picture: Figure, tmp_path: Path) -> None:
@@ -111,16 +106,11 @@ def test_the_picture_is_the_same_every_time(view: Overview, picture: Figure, tmp
         write_picture(tmp_path / "one.gif", view)
 
 
-def test_many_laws_in_one_body_are_counted() -> None:
-    assert shortened(["a", "b"]) == ("a", "b")
-    assert shortened(["a", "b", "c", "d", "e", "f"]) == ("a", "b", "c", "and 3 more")
-
-
-def test_a_line_in_a_rectangle_is_measured() -> None:
-    r = Rect(1.0, 1.0, 2.0, 1.0)
-    assert r.inside((-5.0, 1.0), (5.0, 1.0)) == pytest.approx(2.0)
-    assert r.inside((-5.0, 3.0), (5.0, 3.0)) == 0.0 and r.inside((1.0, 1.2), (1.0, 1.4)) == pytest.approx(0.2)
-    assert r.border((11.0, 1.0)) == pytest.approx((2.0, 1.0)) and PITCH_IN[0] > 2
+def test_many_laws_and_sensors_in_one_body_are_counted(view: Overview) -> None:
+    assert [text for text, _ in heat_lines(["a", "b"])] == ["+ a", "+ b"]
+    assert [text for text, _ in heat_lines(list("abcdef"))] == ["+ a", "+ b", "+ c", "+ 3 more"]
+    more = replace(view, sensors=tuple((f"a_channel_{k}", "bed") for k in range(9)))
+    assert [text for text, _ in sensor_lines(more, "bed")] == ["◆ a_channel_0 and 8 more"]
 
 
 # heat
@@ -147,10 +137,8 @@ def test_flows_have_direction_watts_and_rises(view: Overview) -> None:
     arrows = [p for p in fig.axes[0].patches if isinstance(p, FancyArrowPatch)]
     assert len(arrows) >= 16
     at = {t.get_text(): t.get_position()[0] for t in fig.axes[0].texts}
-    ends = {tuple(np.round(p._posA_posB, 2).ravel()) for p in arrows}  # type: ignore[attr-defined]
-    # -8 W from bed to table: the arrow runs from the table's side to the bed's
-    between = [e for e in ends if min(at["bed"], at["table"]) - 1 < e[0] < max(at["bed"], at["table"]) + 1]
-    assert any((e[2] - e[0]) * (at["bed"] - at["table"]) > 0 for e in between)
+    ends = [tuple(np.round(p._posA_posB, 2)[:, 0]) for p in arrows]  # type: ignore[attr-defined]
+    assert (round(at["table"], 2), round(at["bed"], 2)) in ends  # −8 W from bed to table
 
 
 # fit
