@@ -19,7 +19,7 @@ from models.selection.result import GridResult, Training
 from reports.comparison import pictures, story, tables
 from reports.comparison.channel import Channel, leaders, sentence
 from reports.labels import count, family_label, listed, number, selector_label
-from reports.layout import Details, Heading, Items, Page, Pairs, Section, Text, given, with_unit
+from reports.layout import Details, Group, Heading, Items, Page, Pairs, Section, Text, given, with_unit
 from reports.rendering import FORMATS, write_page
 
 
@@ -40,12 +40,12 @@ def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
     unit = unit_label(units.pop()) if len(units) == 1 else "own unit"
     said = [with_unit(text, c.unit) for c in channels for text in sentence(c)]
     left_out = pictures.left_out_panels(channels)
+    models = (pictures.tried_panel(channels), pictures.time_panel(channels))
     blocks = given(
         None if left_out else Text("No left-out prediction of these models was kept.", "soft"),
         *left_out,
         leaders(channels, rule, unit),
-        pictures.tried_panel(channels),
-        pictures.time_panel(channels),
+        *(models if len(channels) > 1 else (Group(models, "pair"),)),
         pictures.runs_viewer(channels),
         Details("What a laboratory can check", _checks(channels, rule)),
     )

@@ -49,7 +49,7 @@ def _left_out(kept: Sequence[tuple[Channel, list[LeftOut]]], along_axis: bool) -
         keys, more = _fan_legend(every)
         notes += more
     if (thinned := max(b.every for b in every)) > 1:
-        notes += f" Drawn: up to every {thinned}th sample."
+        notes += f" Of long runs one sample in {thinned} is drawn."
     caption = f"Runs left out: recorded and predicted{' along the axis' if along_axis else ''}, {protocol}"
     return Panel(caption, tuple(plots), keys=tuple(keys), notes=(notes,))
 

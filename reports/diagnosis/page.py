@@ -113,8 +113,9 @@ def _sentences(d: Diagnosis, errors: Sequence[str], continued: Continued | None)
 
 
 def _claim(k: int, x: Finding) -> Text:
-    sure = f"{tables.probability_label(x.probability)}, {tables.likelihood(x.probability)}"
-    return Text(shortened(x.statement), "lead", f"{k}. {sure}:")
+    said, chance = shortened(x.statement), tables.probability_label(x.probability)
+    stated = chance.replace(tables.NARROW, " ") in said  # by the statement of an unsure finding
+    return Text(said, "lead", f"{k}." if stated else f"{k}. {chance}, {tables.likelihood(x.probability)}:")
 
 
 def _pictures(d: Diagnosis) -> Iterator[Any]:

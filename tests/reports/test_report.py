@@ -231,6 +231,8 @@ def test_the_share_that_is_removed_has_its_error_over_the_runs() -> None:
 
 def test_the_page_is_a_sentence_three_pictures_a_table_the_viewer_and_one_fold(toy_batches: Maker) -> None:
     (section,) = page_of([training(results(toy_batches)["z"])], RULE).sections
+    assert [type(b).__name__ for b in section.blocks] == ["Panel", "Table", "Group", "Viewer", "Details"]
+    (section,) = page_of([training(r) for r in results(toy_batches).values()], RULE).sections
     assert [type(b).__name__ for b in section.blocks] == ["Panel", "Table", "Panel", "Panel", "Viewer", "Details"]
 
 
