@@ -1,18 +1,15 @@
 """The state machine of `compensation.safety` as a program: one source for Python and for the exports.
 
-The program is elementwise: element i of every input and output is one value that is sent, with its own state. `run` is
-the program for one value as compiled Python; exports lower the same program to C and structured text.
+The program is elementwise: element i of every input and output is one value that is sent, with its own state. `run`
+steps through the operations for one value; exports lower the same program to C and structured text.
 """
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
-from typing import Any
 
-import numpy as np
-
-from compensation.exports.lowering import Language, Writer, lower
 from data.batch import Channel
 from models.program import Builder, Program
 
@@ -95,43 +92,31 @@ def core(size: int = 1) -> Program:
     return b.program(list(after.values()), zero_start=False)
 
 
-def lower_core(w: Writer, given: Mapping[str, Sequence[str]], limits: Sequence[object]) -> list[list[str]]:
-    """Writes the core behind what sets its inputs, and gives `CARRIED` as expressions, an element for each value.
-
-    Args:
-        given: expressions of the inputs in front of the limits, one for each value.
-        limits: `safety.Limits` of each value.
-    """
-    before = [expression for name in list(INPUTS)[: -len(LIMITS)] for expression in given[name]]
-    for k, expression in enumerate(before):
-        w.put(f"{w.prefix}core_v0[{k}]", expression)
-    table = w.table("core_limits", np.array([float(getattr(each, name)) for name in LIMITS for each in limits]))
-    with w.loop(len(LIMITS) * len(limits)) as i:
-        w.put(f"{w.prefix}core_v0[{len(before)} + {i}]", f"{table}[{i}]")
-    program = core(len(limits))
-    return lower(w, program, "core_", _labels(program))
-
-
-def _labels(program: Program) -> dict[int, str]:
-    """Names of the nodes that are inputs, outputs, and outputs of the row before."""
-    names = dict(zip(program.outputs, CARRIED, strict=True))
-    size = len(program.channels) // len(INPUTS)
-    for k, n in enumerate(program.nodes):
-        if n.op == "pick":
-            names[k] = list(INPUTS)[int(n.data["places"][0]) // size]
-        elif n.op == "previous":
-            names[k] = f"{names[n.args[0]]}_before"
-    return names
+_ON_NUMBERS: Mapping[str, Callable[..., float]] = {  # on arrays, as `Program.runner` has them, four times as slow
+    "add": operator.add, "sub": operator.sub, "mul": operator.mul, "min": min, "max": max,
+    "less": lambda a, b: float(a < b), "equal": lambda a, b: float(a == b),
+    "select": lambda condition, a, b: a if condition > 0.5 else b,
+}  # fmt: skip
 
 
 @cache
 def run() -> Callable[..., tuple[float, ...]]:
     """`step(inputs, *carried) -> carried`: the core for one value; `inputs` in the order of `INPUTS`."""
-    program, w = core(), Writer(Language())
-    results = ", ".join(element for (element,) in lower(w, program))
-    carried = [f"v{program.outputs[k]}" for k in range(len(CARRIED))]
-    text = "\n".join([f"def step(v0, {', '.join(carried)}, first_row=False):", *w.lines, f"    return {results}"])
-    space: dict[str, Any] = {}
-    exec(compile(text, "<compensation.core>", "exec"), space)
-    step: Callable[..., tuple[float, ...]] = space["step"]
+    program = core()
+    initial = [float(n.data["value"][0]) if n.op == "constant" else 0.0 for n in program.nodes]
+    picked = [(k, int(n.data["places"][0])) for k, n in enumerate(program.nodes) if n.op == "pick"]
+    previous = [k for k, n in enumerate(program.nodes) if n.op == "previous"]  # in the order of `CARRIED`
+    given = {"input", "constant", "pick", "previous"}
+    computed = [(k, _ON_NUMBERS[n.op], n.args) for k, n in enumerate(program.nodes) if n.op not in given]
+
+    def step(inputs: Sequence[float], *carried: float) -> tuple[float, ...]:
+        values = initial.copy()
+        for k, place in picked:
+            values[k] = inputs[place]
+        for k, value in zip(previous, carried, strict=True):
+            values[k] = value
+        for k, operation, args in computed:
+            values[k] = operation(*[values[a] for a in args])
+        return tuple([values[k] for k in program.outputs])
+
     return step

@@ -7,49 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from compensation.core import INPUTS, lower_core
+from compensation.core import INPUTS
 from compensation.exports.base import MOST, AxisModel, Export, Exporter, ascii_text, identifiers, stale_rows
-from compensation.exports.lowering import Language, Writer, lower, number_lines
-
-
-class C(Language):
-    """C99."""
-
-    functions: ClassVar[Mapping[str, str]] = {
-        "abs": "fabs",
-        "exp": "exp",
-        "min": "fmin",
-        "max": "fmax",
-        "single": "(double)(float)",
-        "tanh": "tanh",
-        "or": "||",
-        "less": "<",
-        "equal": "==",
-    }
-
-    def comment(self, text: str) -> str:
-        return f"/* {ascii_text(text)} */"
-
-    def put(self, target: str, value: str) -> str:
-        return f"{target} = {value};"
-
-    def loop(self, index: str, count: int | str, first: int | str = 0) -> tuple[str, str]:
-        return f"for ({index} = {first}; {index} < {count}; {index}++) {{", "}"
-
-    def when(self, condition: str) -> tuple[str, str, str]:
-        return f"if ({condition}) {{", "} else {", "}"
-
-    def repeat(self, left: str, right: str) -> tuple[str, str]:
-        return f"while ({left} != {right}) {{", "}"
-
-    def number(self, value: float) -> str:
-        return repr(value) if value >= 0 else f"({value!r})"
-
-    def choice(self, condition: str, yes: str, no: str) -> str:
-        return f"{condition} ? {yes} : {no}"
-
-    def power(self, base: str, exponent: float) -> str:
-        return f"pow({base}, {exponent!r})"
+from compensation.exports.lowering import Language, Writer, lower, lower_core, number_lines
 
 
 class CExport(Exporter):
@@ -172,7 +132,7 @@ def move_source(export: Export, function: str) -> str:
     """What both sources share: the state machine of what is sent, moved by its inputs in static arrays by a
     function whose head is `function` and the arguments of a movement."""
     name, sent = export.stem, [(k, a, *out) for k, a in enumerate(export.axes) for out in a.sent]
-    w, count = Writer(C()), len(sent)
+    w, count = Writer(Language()), len(sent)
     given = {
         "elapsed_s": ["elapsed_s"] * count,
         **{n: [f"{n}[{i}]" for i in range(count)] for n in ("wanted_um", "usable", "faulty")},
@@ -324,7 +284,7 @@ def _table(name: str, values: np.ndarray) -> str:
 
 def _axis(a: AxisModel, prefix: str, places: Mapping[str, int]) -> str:
     """State, constants and row function of one axis."""
-    p, w = a.program, Writer(C(), prefix)
+    p, w = a.program, Writer(Language(), prefix)
     outputs = [element for (element,) in lower(w, p)]
     trust = "1.0"
     if a.trust is not None:

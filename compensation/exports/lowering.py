@@ -1,4 +1,4 @@
-"""Programs as statements of a language with arrays, loops and branches: C, structured text and Python.
+"""Programs as statements of a language with arrays, loops and branches: C and structured text.
 
 Node k becomes one block that sets the array ``v<k>``, or the number of that name where it has one element; ``s<k>`` is
 what it carries from row to row, ``c<k>_<name>`` its constants. All keep their values from row to row. `first_row` is
@@ -8,13 +8,15 @@ true in the first row, in which every block sets its own state: a reset needs no
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
 
+from compensation.core import CARRIED, INPUTS, LIMITS, core
+from compensation.exports.base import ascii_text
 from data.arrays import Array
 from models.program import Node, Program
 
@@ -24,42 +26,45 @@ Shape = tuple[str, int]  # "real", "whole" or "logical", and the length; 0 for a
 
 
 class Language:
-    """Spelling of statements, here of Python for nodes of one element; others override what differs.
+    """Spelling of statements, here of C99; others override what differs.
 
     Operators + - * / < and indices x[i] are the same in all languages.
     """
 
-    functions: ClassVar[Mapping[str, str]] = {"abs": "abs", "min": "min", "max": "max", "less": "<", "equal": "=="}
+    functions: ClassVar[Mapping[str, str]] = {
+        "abs": "fabs", "exp": "exp", "min": "fmin", "max": "fmax", "single": "(double)(float)", "tanh": "tanh",
+        "or": "||", "less": "<", "equal": "==",
+    }  # fmt: skip
 
     def comment(self, text: str) -> str:
-        return f"# {text}"
+        return f"/* {ascii_text(text)} */"
 
     def put(self, target: str, value: str) -> str:
-        return f"{target} = {value}"
+        return f"{target} = {value};"
 
     def loop(self, index: str, count: int | str, first: int | str = 0) -> tuple[str, str]:
         """First and last line of a loop over first … count − 1."""
-        return f"for {index} in range({first}, {count}):", ""
+        return f"for ({index} = {first}; {index} < {count}; {index}++) {{", "}"
 
     def when(self, condition: str) -> tuple[str, str, str]:
         """First line, line before what else is done, and last line of a branch."""
-        return f"if {condition}:", "else:", ""
+        return f"if ({condition}) {{", "} else {", "}"
 
     def repeat(self, left: str, right: str) -> tuple[str, str]:
         """First and last line of a loop while two whole numbers differ."""
-        return f"while {left} != {right}:", ""
+        return f"while ({left} != {right}) {{", "}"
 
     def number(self, value: float) -> str:
         """A number inside an expression."""
-        return f"({value!r})"
+        return repr(value) if value >= 0 else f"({value!r})"
 
     def choice(self, condition: str, yes: str, no: str) -> str:
         """An expression that is `yes` where the condition holds, else `no`; both are evaluated or free of effects."""
-        return f"{yes} if {condition} else {no}"
+        return f"{condition} ? {yes} : {no}"
 
     def power(self, base: str, exponent: float) -> str:
         """base ** exponent for a base above 0."""
-        return f"{base} ** {exponent!r}"
+        return f"pow({base}, {exponent!r})"
 
     def call(self, function: str, *args: str) -> str:
         return f"{self.functions[function]}({', '.join(args)})"
@@ -440,6 +445,35 @@ def lower(
     elements = [[lowered.item(o, str(i)) for i in range(program.nodes[o].size)] for o in program.outputs]
     w.prefix = outer
     return elements
+
+
+def lower_core(w: Writer, given: Mapping[str, Sequence[str]], limits: Sequence[object]) -> list[list[str]]:
+    """Writes the core behind what sets its inputs, and gives `CARRIED` as expressions, an element for each value.
+
+    Args:
+        given: expressions of the inputs in front of the limits, one for each value.
+        limits: `safety.Limits` of each value.
+    """
+    before = [expression for name in list(INPUTS)[: -len(LIMITS)] for expression in given[name]]
+    for k, expression in enumerate(before):
+        w.put(f"{w.prefix}core_v0[{k}]", expression)
+    table = w.table("core_limits", np.array([float(getattr(each, name)) for name in LIMITS for each in limits]))
+    with w.loop(len(LIMITS) * len(limits)) as i:
+        w.put(f"{w.prefix}core_v0[{len(before)} + {i}]", f"{table}[{i}]")
+    program = core(len(limits))
+    return lower(w, program, "core_", _labels(program))
+
+
+def _labels(program: Program) -> dict[int, str]:
+    """Names of the nodes that are inputs, outputs, and outputs of the row before."""
+    names = dict(zip(program.outputs, CARRIED, strict=True))
+    size = len(program.channels) // len(INPUTS)
+    for k, n in enumerate(program.nodes):
+        if n.op == "pick":
+            names[k] = list(INPUTS)[int(n.data["places"][0]) // size]
+        elif n.op == "previous":
+            names[k] = f"{names[n.args[0]]}_before"
+    return names
 
 
 def number_lines(values: Array, number: Callable[[float], str]) -> list[str]:

@@ -7,9 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from compensation.core import INPUTS, lower_core
+from compensation.core import INPUTS
 from compensation.exports.base import MOST, AxisModel, Export, Exporter, ascii_text, identifiers, stale_rows, wrapped
-from compensation.exports.lowering import Language, Shape, Writer, lower, number_lines
+from compensation.exports.lowering import Language, Shape, Writer, lower, lower_core, number_lines
 
 MOST_NUMBERS = 2000  # constants of one block: 16 kB, which small controllers hold and compile
 _TEXT = 120  # characters of a string

@@ -1,4 +1,4 @@
-"""The state machine as a program: one step for several values at once, by the runner and as compiled Python."""
+"""The state machine as a program: one step for several values at once, by the runner and by numbers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def hostile(n: int, seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_runner_and_the_compiled_step_agree_for_several_values(seed: int) -> None:
+def test_the_runner_and_the_step_of_one_value_agree_for_several_values(seed: int) -> None:
     values = [hostile(2000, 10 * seed + k) for k in range(3)]
     program = core.core(3)
     run, state = program.runner(), program.begin()

@@ -1,4 +1,4 @@
-"""What exports send, under hostile streams: C, structured text and the compiled core give the same to 1e-9 µm."""
+"""What exports send, under hostile streams: C, structured text and the core give the same to 1e-9 µm."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def machine(stale_s: float = 5.0) -> Export:
 
 
 class Sender:
-    """What an export must send: the compiled core for each output of each axis."""
+    """What an export must send: the core for each output of each axis."""
 
     def __init__(self, axes: Sequence[AxisModel]) -> None:
         self.axes = axes
