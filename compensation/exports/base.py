@@ -30,7 +30,7 @@ MOST = 1e30  # a larger value is no number: NaN, infinity, or a model that has d
 
 
 @dataclass(frozen=True)
-class AxisModel:
+class ExportedAxis:
     """The model of one error channel.
 
     Attributes:
@@ -141,7 +141,7 @@ class Export:
     digest: str
     created: str
     simulated: bool
-    axes: tuple[AxisModel, ...]
+    axes: tuple[ExportedAxis, ...]
 
     @property
     def stem(self) -> str:
@@ -160,7 +160,7 @@ class Export:
             "sign": SIGN,
         }
 
-    def heading(self, axes: Sequence[AxisModel] | None = None) -> list[str]:
+    def heading(self, axes: Sequence[ExportedAxis] | None = None) -> list[str]:
         """The statement as lines of ASCII text for a comment, at most 110 characters each."""
         lines = [
             f"thermodrift: thermal error of machine {self.machine}",
@@ -280,7 +280,7 @@ def wrapped(lines: Iterable[str]) -> list[str]:
     return out
 
 
-def _axis_lines(a: AxisModel) -> list[str]:
+def _axis_lines(a: ExportedAxis) -> list[str]:
     p = a.program
     lines = [f"Axis {a.axis}: one row every {p.step_s:g} s", "Inputs:"]
     for name, unit, required, usable in zip(p.channels, p.units, p.required, a.usable(), strict=True):
@@ -305,7 +305,7 @@ def _line(p: Program) -> str:
     return f"error at P = error_um + slope_um_per_mm * (P - {p.reference_mm:g} mm), P in mm of {p.along}"
 
 
-def _fallback(a: AxisModel) -> str:
+def _fallback(a: ExportedAxis) -> str:
     return (
         f"a required input that is missing or not usable, or {a.limits.stale_s:g} s without a row: hold the offset for "
         f"{a.limits.hold_s:g} s, then fade to 0 at {a.limits.rate_um_per_s:g} um/s; valid for "

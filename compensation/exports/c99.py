@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from compensation.core import INPUTS
-from compensation.exports.base import MOST, AxisModel, Export, Exporter, ascii_text, identifiers, stale_rows
+from compensation.exports.base import MOST, Export, ExportedAxis, Exporter, ascii_text, identifiers, stale_rows
 from compensation.exports.lowering import Language, Writer, lower, lower_core, number_lines
 
 
@@ -282,7 +282,7 @@ def _table(name: str, values: np.ndarray) -> str:
     return f"static const {kind} {name}[{len(values)}] = {{\n    {inner}\n}};"
 
 
-def _axis(a: AxisModel, prefix: str, places: Mapping[str, int]) -> str:
+def _axis(a: ExportedAxis, prefix: str, places: Mapping[str, int]) -> str:
     """State, constants and row function of one axis."""
     p, w = a.program, Writer(Language(), prefix)
     outputs = [element for (element,) in lower(w, p)]

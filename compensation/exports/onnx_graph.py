@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from compensation.exports.base import AxisModel, Export, Exporter, identifiers
+from compensation.exports.base import Export, ExportedAxis, Exporter, identifiers
 from compensation.exports.lowering import curve_pieces
 from data.arrays import Array
 from models.program import Node, Program
@@ -40,7 +40,7 @@ class OnnxExport(Exporter):
         return out
 
 
-def metadata(export: Export, axis: AxisModel) -> dict[str, str]:
+def metadata(export: Export, axis: ExportedAxis) -> dict[str, str]:
     """What `metadata_props` states: texts as they are, everything else as JSON."""
     stated = axis.described()
     channels = {part: json.dumps([i[name] for i in stated["inputs"]]) for part, name in _COLUMNS.items()}
@@ -236,13 +236,13 @@ _STEPS: Mapping[str, Step] = {
 }
 
 
-def _sizes(axis: AxisModel) -> tuple[int, int, int]:
+def _sizes(axis: ExportedAxis) -> tuple[int, int, int]:
     """Channels, numbers carried, outputs."""
     p = axis.program
     return len(p.channels), sum(n.state_size() for n in p.nodes[1:]), p.width
 
 
-def _step(axis: AxisModel, order: tuple[str, str, str]) -> Any:
+def _step(axis: ExportedAxis, order: tuple[str, str, str]) -> Any:
     """The graph of one row; `order` is that of its inputs, and in `state` first that of its outputs too."""
     p, g = axis.program, Graph()
     channels, carried, outputs = _sizes(axis)
@@ -289,7 +289,7 @@ def _value(name: str, shape: list[Any]) -> Any:
     return helper.make_tensor_value_info(name, kind, shape)
 
 
-def _batch(axis: AxisModel) -> Any:
+def _batch(axis: ExportedAxis) -> Any:
     """The graph of all rows: the step, scanned from the state before the first row."""
     channels, carried, outputs = _sizes(axis)
     start: Array = np.concatenate([np.full(channels, np.nan), np.zeros(carried)])
@@ -302,7 +302,7 @@ def _batch(axis: AxisModel) -> Any:
     )
 
 
-def _model(export: Export, axis: AxisModel, graph: Any) -> bytes:
+def _model(export: Export, axis: ExportedAxis, graph: Any) -> bytes:
     model = helper.make_model(
         graph, producer_name="thermodrift", opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION
     )

@@ -6,7 +6,7 @@ import uuid
 from typing import ClassVar
 
 from compensation.exports import c99, structured_text
-from compensation.exports.base import MOST, AxisModel, Export, Exporter, identifiers, wrapped
+from compensation.exports.base import MOST, Export, ExportedAxis, Exporter, identifiers, wrapped
 from compensation.exports.lowering import Writer
 from compensation.exports.structured_text import StructuredText, function_block
 
@@ -36,7 +36,7 @@ class ReceiverExport(Exporter):
         return {f"{stem}.st": "\n".join(blocks), **out, f"{stem}.h": _header(export), f"{stem}.c": _source(export)}
 
 
-def _block(export: Export, a: AxisModel, name: str) -> str:
+def _block(export: Export, a: ExportedAxis, name: str) -> str:
     w = Writer(StructuredText(), indent=0)
     finite = [structured_text.within(f"received_{output}", -MOST, MOST) for output, _, _ in a.sent]
     w.put("received_ok", " AND ".join(["valid", *finite]))

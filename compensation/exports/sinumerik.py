@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from compensation.exports.base import AxisModel, Export, Exporter, wrapped
+from compensation.exports.base import Export, ExportedAxis, Exporter, wrapped
 
 
 class SinumerikExport(Exporter):
@@ -36,7 +36,7 @@ def _commented(lines: list[str]) -> str:
     return "\n".join(f"; {line}".rstrip() for line in wrapped(lines))
 
 
-def _axis(a: AxisModel) -> str:
+def _axis(a: ExportedAxis) -> str:
     p, name = a.program, a.axis.upper()
     data = [
         (f"$MA_TEMP_COMP_TYPE[{name}] = {'3' if p.along else '1'}", "MD32750: bit 0 offset, bit 1 slope"),

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from compensation.core import INPUTS
-from compensation.exports.base import MOST, AxisModel, Export, Exporter, ascii_text, identifiers, stale_rows, wrapped
+from compensation.exports.base import MOST, Export, ExportedAxis, Exporter, ascii_text, identifiers, stale_rows, wrapped
 from compensation.exports.lowering import Language, Shape, Writer, lower, lower_core, number_lines
 
 MOST_NUMBERS = 2000  # constants of one block: 16 kB, which small controllers hold and compile
@@ -92,7 +92,7 @@ class StructuredTextExport(Exporter):
         return {f"{export.stem}{self.suffix}": "\n".join(blocks)}
 
 
-def _block(export: Export, a: AxisModel, name: str) -> str:
+def _block(export: Export, a: ExportedAxis, name: str) -> str:
     p, w = a.program, Writer(StructuredText(), indent=0)
     names = identifiers(p.channels)
     with w.when("reset"):
@@ -151,7 +151,7 @@ MOVED = (
 )
 
 
-def sent_outputs(a: AxisModel) -> list[str]:
+def sent_outputs(a: ExportedAxis) -> list[str]:
     """Declarations of what the control adds."""
     return [
         "state : DINT; (* 0 off, 1 warm-up, 2 active, 3 hold, 4 fade-out *)",
@@ -159,7 +159,7 @@ def sent_outputs(a: AxisModel) -> list[str]:
     ]
 
 
-def move(w: Writer, a: AxisModel) -> None:
+def move(w: Writer, a: ExportedAxis) -> None:
     """Moves what is sent towards `wanted_um`, as `usable` and `faulty` of this call say."""
     w.comment("what is sent, within the limits of size, rate and step; held, then faded to 0, without usable input")
     count = len(a.sent)
@@ -214,7 +214,7 @@ def within(x: str, low: float, high: float) -> str:
     return f"({x} >= {real(low)}) AND ({x} <= {real(high)})"
 
 
-def _row(w: Writer, a: AxisModel, names: Sequence[str]) -> None:
+def _row(w: Writer, a: ExportedAxis, names: Sequence[str]) -> None:
     """One row of the model, and what it wants to be sent."""
     w.comment("one row of the model; an input that is not usable is missing")
     w.put("lacking", "FALSE")

@@ -14,8 +14,7 @@ import pandas as pd
 
 from compensation.exchange import MqttExchange
 from compensation.exports import EXPORTS
-from compensation.exports.base import AxisModel as ExportedAxis
-from compensation.exports.base import Export
+from compensation.exports.base import Export, ExportedAxis
 from compensation.exports.region import trust_program
 from compensation.rehearsal import Rehearsal, failure, readings_of, rehearse
 from compensation.runtime import AxisModel, Compensator

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from compensation.exports.base import AxisModel, Export
+from compensation.exports.base import Export, ExportedAxis
 from compensation.exports.onnx_graph import OnnxExport
 from compensation.safety import Limits
 from data.errors import InputError
@@ -48,7 +48,7 @@ def write_served(stored: StoredModel, folder: Path, step_s: float) -> tuple[str,
 
 
 def _export(stored: StoredModel, program: Program, content: bytes) -> Export:
-    axis = AxisModel(stored.family.target, program, {}, Limits())
+    axis = ExportedAxis(stored.family.target, program, {}, Limits())
     return Export(
         machine=stored.machine.machine, model=stored.family.key, version=str(stored.info.get("training_id", "")),
         digest=hashlib.sha256(content).hexdigest(), created=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),

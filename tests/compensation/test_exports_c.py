@@ -13,7 +13,7 @@ import pytest
 from test_exports_programs import PROGRAMS, Batches, dynamic, every_operation, fitted, rows_with_holes
 
 from compensation.exports import EXPORTS
-from compensation.exports.base import AxisModel, Export
+from compensation.exports.base import Export, ExportedAxis
 from models.program import replay
 from tests.toys.exported import LIMITS, export_of, offset_only, straight
 
@@ -64,7 +64,7 @@ class Compiled:
 
 def test_every_family_in_one_machine(toy_batches: Batches, tmp_path: Path) -> None:
     programs = {key: fitted(key, toy_batches) for key in PROGRAMS}
-    export = export_of(*(AxisModel(key, p, {}, LIMITS) for key, (p, _) in programs.items()))
+    export = export_of(*(ExportedAxis(key, p, {}, LIMITS) for key, (p, _) in programs.items()))
     machine = Compiled(export, tmp_path)
     values = {c: rows[:, k] for p, rows in programs.values() for k, c in enumerate(p.channels)}
     got = []

@@ -10,7 +10,7 @@ import pytest
 from test_exports_programs import PROGRAMS, Batches, dynamic, every_operation, fitted, rows_with_holes
 
 from compensation.exports import EXPORTS
-from compensation.exports.base import AxisModel
+from compensation.exports.base import ExportedAxis
 from models.program import Program, replay
 from tests.toys.exported import LIMITS, export_of
 
@@ -24,7 +24,7 @@ def session(path: Path) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
-def check(axis: AxisModel, rows: np.ndarray, folder: Path) -> None:
+def check(axis: ExportedAxis, rows: np.ndarray, folder: Path) -> None:
     step_path, batch_path = EXPORTS["onnx"]().write(export_of(axis), folder)
     program: Program = axis.program
     wanted = replay(program, rows)
@@ -47,7 +47,7 @@ def check(axis: AxisModel, rows: np.ndarray, folder: Path) -> None:
 @pytest.mark.parametrize("key", PROGRAMS)
 def test_a_family_row_by_row_and_as_a_batch(key: str, toy_batches: Batches, tmp_path: Path) -> None:
     program, rows = fitted(key, toy_batches)
-    check(AxisModel("z", program, {}, LIMITS), rows, tmp_path)
+    check(ExportedAxis("z", program, {}, LIMITS), rows, tmp_path)
 
 
 def test_every_operation_with_holes(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from compensation.exports import EXPORTS
-from compensation.exports.base import AxisModel, identifiers
+from compensation.exports.base import ExportedAxis, identifiers
 from data.batch import Batch, Channel
 from data.errors import InputError
 from models.families import FAMILIES
@@ -96,8 +96,8 @@ def rows_with_holes(program: Program, n: int = 60) -> np.ndarray:
     return rows
 
 
-def dynamic(axis: str = "z") -> AxisModel:
-    return AxisModel(axis, every_operation(), {"a": (5.0, 35.0), "y": (0.0, 500.0)}, LIMITS)
+def dynamic(axis: str = "z") -> ExportedAxis:
+    return ExportedAxis(axis, every_operation(), {"a": (5.0, 35.0), "y": (0.0, 500.0)}, LIMITS)
 
 
 def test_axes_of_different_steps_cannot_share_a_function(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from test_runtime import INPUTS, model_of
 
 from compensation import core
 from compensation.exports import EXPORTS
-from compensation.exports.base import AxisModel, Export
+from compensation.exports.base import Export, ExportedAxis
 from compensation.exports.region import trust_program
 from compensation.safety import Axis, Limits, silence, step
 from data.batch import Channel
@@ -42,7 +42,7 @@ def machine(stale_s: float = 5.0) -> Export:
 class Sender:
     """What an export must send: the core for each output of each axis."""
 
-    def __init__(self, axes: Sequence[AxisModel]) -> None:
+    def __init__(self, axes: Sequence[ExportedAxis]) -> None:
         self.axes = axes
         self.carried = [[tuple(core.CARRIED.values()) for _ in a.sent] for a in axes]
 
@@ -173,7 +173,7 @@ def test_a_dead_sender_fades_also_where_the_elapsed_time_is_no_number(elapsed_s:
     assert np.abs(np.diff(got, axis=0)).max() == 0.5 and np.ptp(got, axis=1).max() == 0.0
 
 
-def weighed() -> AxisModel:
+def weighed() -> ExportedAxis:
     """An offset whose trust falls outside 10 to 30 degC of t0, which cannot be beyond -20 and 60 degC."""
     a = offset_only()
     b = Builder({n: Channel(n, "temperature", "degC") for n in ("t0", "t1")}, 300.0)

@@ -14,7 +14,7 @@ import pytest
 from test_exports_programs import PROGRAMS, Batches, dynamic, every_operation, fitted, rows_with_holes
 
 from compensation.exports import EXPORTS
-from compensation.exports.base import AxisModel
+from compensation.exports.base import ExportedAxis
 from compensation.exports.structured_text import StructuredTextExport, real
 from data.errors import InputError
 from models.program import replay
@@ -96,13 +96,13 @@ class Block:
         return self.space
 
 
-def block_of(axis: AxisModel) -> Block:
+def block_of(axis: ExportedAxis) -> Block:
     (text,) = StructuredTextExport().files(export_of(axis)).values()
     assert isinstance(text, str)
     return Block(text)
 
 
-def errors(axis: AxisModel, rows: np.ndarray) -> np.ndarray:
+def errors(axis: ExportedAxis, rows: np.ndarray) -> np.ndarray:
     block, out = block_of(axis), []
     for row in rows:
         given = {f"in_{c}": v for c, v in zip(axis.program.channels, row.tolist(), strict=True)}
@@ -111,7 +111,7 @@ def errors(axis: AxisModel, rows: np.ndarray) -> np.ndarray:
     return np.array(out)
 
 
-def fits(key: str, axis: AxisModel) -> bool:
+def fits(key: str, axis: ExportedAxis) -> bool:
     return StructuredTextExport().refusal(export_of(axis)) is None
 
 
@@ -120,7 +120,7 @@ def test_a_family_computes_what_its_program_does_or_is_too_large(
     key: str, toy_batches: Batches, tmp_path: Path
 ) -> None:
     program, rows = fitted(key, toy_batches)
-    axis = AxisModel("z", program, {}, LIMITS)
+    axis = ExportedAxis("z", program, {}, LIMITS)
     if not fits(key, axis):
         with pytest.raises(InputError, match=r"^export st: axis z has \d+ constants, most in \w+; a block holds 2000"):
             EXPORTS["st"]().write(export_of(axis), tmp_path)
@@ -130,13 +130,13 @@ def test_a_family_computes_what_its_program_does_or_is_too_large(
 
 def test_every_operation_with_holes() -> None:
     rows = rows_with_holes(every_operation())
-    axis = AxisModel("z", every_operation(), {}, LIMITS)
+    axis = ExportedAxis("z", every_operation(), {}, LIMITS)
     assert np.allclose(errors(axis, rows), replay(axis.program, rows), rtol=0.0, atol=1e-9, equal_nan=True)
 
 
 @pytest.mark.parametrize("key", [*PROGRAMS, "every", "straight"])
 def test_declarations_blocks_and_characters(key: str, toy_batches: Batches) -> None:
-    axis = {"every": dynamic(), "straight": straight()}.get(key) or AxisModel(
+    axis = {"every": dynamic(), "straight": straight()}.get(key) or ExportedAxis(
         "z", fitted(key, toy_batches)[0], {}, LIMITS
     )
     (text,) = StructuredTextExport().files(export_of(axis)).values()
