@@ -162,18 +162,11 @@ def rehearse(
         shown_s += float(at_s[-1]) + GAP_S
     found = {what: {a: np.array(series[f"{what} {a}"]) for a in axes} for what in ("before", "after", "sent")}
     return Rehearsal(
-        machine=batches[0].machine,
-        time_s=np.array(times),
-        starts_s=starts_s,
-        before_um=found["before"],
-        after_um=found["after"],
-        sent_um=found["sent"],
-        state={a: tuple(v) for a, v in state.items()},
-        reason={a: tuple(v) for a, v in reason.items()},
-        readings_s=tuple(readings_s),
-        failures=tuple(failures),
-        simulated=any(b.simulated for b in batches),
-    )
+        machine=batches[0].machine, time_s=np.array(times), starts_s=starts_s,
+        before_um=found["before"], after_um=found["after"], sent_um=found["sent"],
+        state={a: tuple(v) for a, v in state.items()}, reason={a: tuple(v) for a, v in reason.items()},
+        readings_s=tuple(readings_s), failures=tuple(failures), simulated=any(b.simulated for b in batches),
+    )  # fmt: skip
 
 
 def failure(text: str) -> Failure:

@@ -290,15 +290,14 @@ class MqttSink:
         if self._closed or not link.connected.is_set():
             raise WorkError(f"{link.where}: {link.problem or 'closed'}; the correction is dropped; check the broker")
         root = f"{link.prefix}/correction"
-        messages: list[tuple[str, str, bool]] = []
-        for axis, offset_um in correction.offset_um.items():
-            messages.append((f"{root}/{_level(axis)}/offset_um", repr(float(offset_um)), False))
-        for axis, slope in correction.slope_um_per_m.items():
-            messages.append((f"{root}/{_level(axis)}/slope_um_per_m", repr(float(slope)), False))
-        for axis, state in correction.state.items():
-            messages.append((f"{root}/{_level(axis)}/state", state, False))
+        record = correction_record(correction)
+        messages = [
+            (f"{root}/{_level(axis)}/{key}", str(value), False)
+            for key in ("offset_um", "slope_um_per_m", "state")
+            for axis, value in record[key].items()
+        ]
         messages.append((f"{link.prefix}/heartbeat", str(correction.heartbeat), False))
-        messages.append((root, json.dumps(correction_record(correction), ensure_ascii=False), True))
+        messages.append((root, json.dumps(record, ensure_ascii=False), True))
         messages.append((self._state_topic, overall_state(correction), True))
         try:
             sent = [link.client.publish(topic, text, qos=1, retain=retain) for topic, text, retain in messages]

@@ -46,6 +46,7 @@ _FIRST_CONNECTION_S = 5.0  # that a new sink waits for its server, before the fi
 _LONGEST_DELAY_S = 5.0  # between two tries to connect
 _INTEGER_BITS = {"SByte": 7, "Byte": 8, "Int16": 15, "UInt16": 16, "Int32": 31, "UInt32": 32, "Int64": 63, "UInt64": 64}
 _NUMBER = ("Double", "Float")
+_OF_AXES = ("readings", "offsets_um", "slopes_um_per_m", "states", "reasons")  # sections of `Nodes`
 _TYPES = {  # of the nodes that are written, by the first word of their key; others are of type String
     "offset": _NUMBER, "slope": _NUMBER, "valid_until_s": ("Double",), "heartbeat": tuple(_INTEGER_BITS)
 }  # fmt: skip
@@ -70,17 +71,7 @@ class Nodes(BaseModel):
     heartbeat: str | None = None
     valid_until_s: str | None = None
 
-    @field_validator(
-        "values",
-        "readings",
-        "offsets_um",
-        "slopes_um_per_m",
-        "states",
-        "reasons",
-        "state",
-        "heartbeat",
-        "valid_until_s",
-    )
+    @field_validator("values", *_OF_AXES, "state", "heartbeat", "valid_until_s")
     @classmethod
     def _node_ids(cls, given: Any) -> Any:
         for node_id in given.values() if isinstance(given, dict) else [given] if given is not None else []:
@@ -101,14 +92,8 @@ def _parsed(node_id: str, namespace: int) -> ua.NodeId:
 def _load_nodes(path: str, machine: Machine, where: str) -> Nodes:
     nodes = load_yaml(Path(path), Nodes, "node file")
     errors = machine.names("error")
-    known: Mapping[str, Collection[str]] = {
-        "values": [name for name in machine.channels if name not in errors],
-        "readings": errors,
-        "offsets_um": errors,
-        "slopes_um_per_m": errors,
-        "states": errors,
-        "reasons": errors,
-    }
+    inputs = [name for name in machine.channels if name not in errors]
+    known: Mapping[str, Collection[str]] = {"values": inputs, **dict.fromkeys(_OF_AXES, errors)}
     for section, names in known.items():
         for name in getattr(nodes, section):
             if name not in names:

@@ -308,12 +308,11 @@ class CsvSource:
         self._stop = threading.Event()
         self._lines = _Lines()
         self._file: BinaryIO | None = None
-        self._waits = False
         if not self._open():
             if not follow or not self._path.parent.is_dir():
                 missing = "file" if self._path.parent.is_dir() else "folder"
                 raise InputError(f"source {address}: no such {missing}; give the path of a CSV file")
-            self._wait_for_file()
+            warn(f"{self._path}: does not exist yet; waiting for it")
 
     def _open(self) -> bool:
         """Open the file, if it exists."""
@@ -327,11 +326,6 @@ class CsvSource:
                 return False
             raise InputError(f"source {self._path}: cannot be read ({error.strerror}); give a CSV file") from None
         return True
-
-    def _wait_for_file(self) -> None:
-        if not self._waits:
-            warn(f"{self._path}: does not exist yet; waiting for it")
-        self._waits = True
 
     def samples(self) -> Iterator[Sample | None]:
         """Samples as their rows are written, None in silence.
@@ -359,9 +353,7 @@ class CsvSource:
     def _next_bytes(self) -> bytes:
         """What was written since the last call; empty when nothing was."""
         if self._file is None:
-            if not self._open():
-                return b""
-            self._waits = False
+            self._open()
         file = self._file
         if file is None:
             return b""
