@@ -43,7 +43,7 @@ _RATE_QUANTILE = 0.999  # of the rate of change in training: a few outliers are 
 _RATE_MARGIN = 3.0  # on that: a door or a coolant valve that training did not see
 _NOISE_SD = 6.0  # standard deviations of noise that one sample does not exceed
 _SECOND_DIFFERENCE = np.sqrt(6.0)  # sd of x[k-1] - 2 x[k] + x[k+1] per sd of independent x
-_HELD_MARGIN = 1.5  # on the longest constant stretch of training
+HELD_MARGIN = 1.5  # on the longest constant stretch of training
 _LEAST_SD_K = 1e-3  # below the resolution of any temperature sensor of a machine
 _LEVEL_MARGIN = 2.0  # on the largest distance from the levels' regression in training runs that were left out
 _LEAST_PARITY = 3  # channels: two that disagree do not say which of them is wrong
@@ -161,19 +161,13 @@ class Substitutes:
         rate = np.concatenate([np.abs(np.diff(v, axis=0)) / np.diff(t)[:, None] for t, v in runs])
         usual = _RATE_MARGIN * np.quantile(rate, _RATE_QUANTILE, axis=0)
         held = [_held_s(t, r, r - _residual(covariance_K2, r), sd_K) for (t, _), r in zip(runs, rises, strict=True)]
+        low = np.array([-_FARTHEST_K if s.low is None else s.low for s in specs])
+        high = np.array([_FARTHEST_K if s.high is None else s.high for s in specs])
+        values = [v for _, v in runs]
         return cls(
-            names,
-            covariance_K2,
-            sd_K,
-            np.maximum(usual, resolution_K / step_s),
-            np.max(held, axis=0),
-            np.array([-_FARTHEST_K if s.low is None else s.low for s in specs]),
-            np.array([_FARTHEST_K if s.high is None else s.high for s in specs]),
-            resolution_K,
-            step_s,
-            _noise_K([values for _, values in runs], resolution_K),
-            *_levels([values for _, values in runs], resolution_K),
-        )
+            names, covariance_K2, sd_K, np.maximum(usual, resolution_K / step_s), np.max(held, axis=0), low, high,
+            resolution_K, step_s, _noise_K(values, resolution_K), *_levels(values, resolution_K),
+        )  # fmt: skip
 
     def usual_K(self, dt_s: float) -> Array:
         """Largest usual change, K, (n,), between two samples that are `dt_s` apart.
@@ -400,7 +394,7 @@ class Guard:
         same = good & (np.abs(x - watch.same) <= _SAME_K)
         same_s = np.where(same, watch.same_s + dt_s, 0.0)
         moved_K = np.where(same, watch.moved_K + predicted_K, 0.0)
-        frozen = same & (same_s > _HELD_MARGIN * np.maximum(s.held_s, s.step_s))
+        frozen = same & (same_s > HELD_MARGIN * np.maximum(s.held_s, s.step_s))
         frozen &= np.abs(moved_K) > limits.frozen_sd * sd_K + s.resolution_K
         for i in np.flatnonzero(frozen):
             status[i] = "frozen"

@@ -42,6 +42,7 @@ class ExportedAxis:
         plausible: channel → least and greatest value that it can have, ±inf where an end is not known.
         trust: share of the correction that the distance from the trained region leaves, see `exports.region`, over
             channels of the program; None: 1.
+        checks: of the sensors, see `exports.region`, over channels of the program; None: none but their range.
     """
 
     axis: str
@@ -51,6 +52,7 @@ class ExportedAxis:
     remark: str = ""
     plausible: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     trust: Program | None = None
+    checks: Program | None = None
 
     @property
     def lever_m(self) -> float:
@@ -117,6 +119,7 @@ class ExportedAxis:
             "trained_region": {name: list(map(float, ends)) for name, ends in self.region.items()},
             "limits": limits,
             "trust": self.trust.as_plain() if self.trust is not None else None,
+            "checks": self.checks.as_plain() if self.checks is not None else None,
             "fallback": _fallback(self),
         }
 
@@ -306,8 +309,9 @@ def _line(p: Program) -> str:
 
 
 def _fallback(a: ExportedAxis) -> str:
+    fails = "missing, not usable, frozen or stepping" if a.checks is not None else "missing or not usable"
     return (
-        f"a required input that is missing or not usable, or {a.limits.stale_s:g} s without a row: hold the offset for "
+        f"a required input that is {fails}, or {a.limits.stale_s:g} s without a row: hold the offset for "
         f"{a.limits.hold_s:g} s, then fade to 0 at {a.limits.rate_um_per_s:g} um/s; valid for "
         f"{a.limits.warm_up_s:g} s before it acts"
     )

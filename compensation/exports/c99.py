@@ -9,7 +9,7 @@ import numpy as np
 
 from compensation.core import INPUTS
 from compensation.exports.base import MOST, Export, ExportedAxis, Exporter, ascii_text, identifiers, stale_rows
-from compensation.exports.lowering import Language, Writer, lower, lower_core, number_lines
+from compensation.exports.lowering import Language, Writer, lower, lower_core, lower_over, number_lines
 
 
 class CExport(Exporter):
@@ -92,7 +92,7 @@ void {name}_reset(void);
 int {name}_step(const double inputs[], double error_um[]);
 
 /* One row and one transmission: offset_um[{upper}_N_AXES] is what the control adds, and slope_um_per_m[] its slope, 0
- * for an axis without one. Returns as {name}_step, where an input that is not usable counts as missing. */
+ * for an axis without one. Returns as {name}_step, where an input that is not usable or fails counts as missing. */
 int {name}_correction_step(const double inputs[], double offset_um[], double slope_um_per_m[]);
 
 /* The two parts of {name}_correction_step, for transmissions more often than rows: a row every {upper}_STEP_S, and a
@@ -285,13 +285,11 @@ def _table(name: str, values: np.ndarray) -> str:
 def _axis(a: ExportedAxis, prefix: str, places: Mapping[str, int]) -> str:
     """State, constants and row function of one axis."""
     p, w = a.program, Writer(Language(), prefix)
+    if a.checks is not None:
+        with w.when("usable_only"):
+            w.put("lacking", f"{lower_over(w, a.checks, 'checks_', p.channels)} > 0.5 ? 1 : lacking")
     outputs = [element for (element,) in lower(w, p)]
-    trust = "1.0"
-    if a.trust is not None:
-        w.memory[f"{prefix}trust_v0"] = ("real", len(a.trust.channels))
-        for k, channel in enumerate(a.trust.channels):
-            w.put(f"{prefix}trust_v0[{k}]", f"{prefix}v0[{p.channels.index(channel)}]")
-        ((trust,),) = lower(w, a.trust, "trust_")
+    trust = lower_over(w, a.trust, "trust_", p.channels) if a.trust is not None else "1.0"
     count = len(p.channels)
     inputs = f"{prefix}v0"  # the last values
     w.memory.pop(inputs, None)

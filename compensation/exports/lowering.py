@@ -163,9 +163,7 @@ class _Lowered:
         """Element of node k; that of a single value whatever the index is."""
         n = self.program.nodes[k]
         if n.op == "constant":
-            value = n.data["value"]
-            alike = bool((value == value[0]).all())
-            return self.language.number(float(value[0])) if alike else f"{self.w.table(f'c{k}_value', value)}[{index}]"
+            return self.part(k, "value", index, n.size)
         if k in self.folded:
             return f"({self.value(k, index)})"
         single = n.size == 1 and k > 0
@@ -445,6 +443,19 @@ def lower(
     elements = [[lowered.item(o, str(i)) for i in range(program.nodes[o].size)] for o in program.outputs]
     w.prefix = outer
     return elements
+
+
+def lower_over(w: Writer, program: Program, prefix: str, channels: Sequence[str]) -> str:
+    """The same of a program over some of the channels in ``v0``: its last output; one before that replaces them."""
+    w.memory[f"{w.prefix}{prefix}v0"] = ("real", len(program.channels))
+    places = [f"{w.prefix}v0[{channels.index(c)}]" for c in program.channels]
+    for k, place in enumerate(places):
+        w.put(f"{w.prefix}{prefix}v0[{k}]", place)
+    *replaced, (last,) = lower(w, program, prefix)
+    for values in replaced:
+        for place, value in zip(places, values, strict=True):
+            w.put(place, value)
+    return last
 
 
 def lower_core(w: Writer, given: Mapping[str, Sequence[str]], limits: Sequence[object]) -> list[list[str]]:

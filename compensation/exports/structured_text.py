@@ -9,7 +9,7 @@ import numpy as np
 
 from compensation.core import INPUTS
 from compensation.exports.base import MOST, Export, ExportedAxis, Exporter, ascii_text, identifiers, stale_rows, wrapped
-from compensation.exports.lowering import Language, Shape, Writer, lower, lower_core, number_lines
+from compensation.exports.lowering import Language, Shape, Writer, lower, lower_core, lower_over, number_lines
 
 MOST_NUMBERS = 2000  # constants of one block: 16 kB, which small controllers hold and compile
 _TEXT = 120  # characters of a string
@@ -227,20 +227,18 @@ def _row(w: Writer, a: ExportedAxis, names: Sequence[str]) -> None:
             with w.otherwise():
                 w.put("lacking", "TRUE")
         w.put("complete", f"complete AND seen[{k}]")
-    w.put("valid", "complete AND NOT lacking")
     w.put("trust", "1.0")
     with w.when("complete"):
         w.put("first_row", "NOT begun")
         w.put("begun", "TRUE")
+        if a.checks is not None:
+            w.put("lacking", f"lacking OR ({lower_over(w, a.checks, 'checks_', a.program.channels)} > 0.5)")
         for output, (value,) in zip(a.output_units, lower(w, a.program), strict=True):
             w.put(output, value)
         if a.trust is not None:
-            w.memory["trust_v0"] = ("real", len(a.trust.channels))
-            for k, channel in enumerate(a.trust.channels):
-                w.put(f"trust_v0[{k}]", f"v0[{a.program.channels.index(channel)}]")
-            ((trust,),) = lower(w, a.trust, "trust_")
-            w.put("trust", trust)
-    w.put("valid", " AND ".join(["valid", *(within(output, -MOST, MOST) for output in a.output_units)]))
+            w.put("trust", lower_over(w, a.trust, "trust_", a.program.channels))
+    finite = (within(output, -MOST, MOST) for output in a.output_units)
+    w.put("valid", " AND ".join(["complete", "NOT lacking", *finite]))
     with w.when("valid"):
         w.put("usable", "1.0")
         for k, ((_, unit, um), error) in enumerate(zip(a.sent, a.output_units, strict=True)):

@@ -15,7 +15,7 @@ import pandas as pd
 from compensation.exchange import MqttExchange
 from compensation.exports import EXPORTS
 from compensation.exports.base import Export, ExportedAxis
-from compensation.exports.region import trust_program
+from compensation.exports.region import checks_program, trust_program
 from compensation.rehearsal import Rehearsal, failure, readings_of, rehearse
 from compensation.runtime import AxisModel, Compensator
 from compensation.safety import ROOM, Limits
@@ -226,7 +226,10 @@ def export_of(models: Mapping[str, StoredModel], folders: Mapping[str, Path], li
         channels = stored.machine.batch_channels()
         plausible = {c: channels[c].plausible for c in program.channels}
         trust = trust_program(made, channels)
-        axes.append(ExportedAxis(made.axis, program, trained, made.limits, remark, plausible, trust))
+        guard, checks = running.guard, None
+        if guard is not None and set(guard.substitutes.names) & set(program.channels):
+            checks = checks_program(guard, program.channels, channels, period_s)
+        axes.append(ExportedAxis(made.axis, program, trained, made.limits, remark, plausible, trust, checks))
     first = next(iter(models.values()))
     return Export(
         machine=first.machine.machine, model=", ".join(models), version=str(first.info.get("training_id", "")),
