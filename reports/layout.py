@@ -327,11 +327,13 @@ def every_block(part: Any) -> Iterator[Any]:
 
 
 def given(*blocks: Any) -> tuple[Any, ...]:
-    """The blocks that there are: without None and without texts, lists and tables of nothing."""
+    """The blocks that there are: without None and without texts, lists and panels of nothing."""
     return tuple(b for b in blocks if b is not None and not _empty(b))
 
 
 def _empty(block: Any) -> bool:
-    """A text, a list or a group whose first field, its content, is empty."""
+    """A panel without plots; a text, a list or a group whose first field, its content, is empty."""
+    if isinstance(block, Panel):
+        return not block.plots
     of_content = isinstance(block, Text | Items | Pairs | Numbers | Group)
     return of_content and not next(iter(vars(block).values()))

@@ -40,7 +40,7 @@ def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
     unit = unit_label(units.pop()) if len(units) == 1 else "own unit"
     said = [with_unit(text, c.unit) for c in channels for text in sentence(c)]
     left_out = pictures.left_out_panels(channels)
-    models = tuple(p for p in (pictures.tried_panel(channels), pictures.time_panel(channels)) if p.plots)
+    models = given(pictures.tried_panel(channels), pictures.time_panel(channels))
     blocks = given(
         None if left_out else Text("No left-out prediction of these models was kept.", "soft"),
         *left_out,

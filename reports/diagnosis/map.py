@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from data.units import unit_label
 from reports.labels import BLUE, INK, number, tex_escaped
-from reports.twin.network_picture import TEXT_PT, Card, Drawn, Lines, arranged, is_shared, link_width_pt, middle
+from reports.twin.network_picture import TEXT_PT, Card, Drawn, Lines, arranged, is_shared, link_widths_pt, middle
 from twin.views.overview import Overview, Tie
 
 MISMATCH = LinearSegmentedColormap.from_list("mismatch", ["#fdf3ea", "#fad3b0", "#f0a266", "#d9692a"])
@@ -80,11 +80,8 @@ def mismatch_picture(view: Overview, found: pd.DataFrame, marks: Sequence[Mark])
     head = "; ".join(f"{m.label}: {m.name}" for m, place in at.items() if place is None) or _head(found)
     title = f"What the simulation of {view.machine} leaves unexplained"
     drawn = arranged(view, cards, [_legend(tints, found)], title, head, errors)
-    links = [t for t in view.ties if not t.ground]
-    for t in links:
-        color = BLUE if t in at.values() else tints.color("heat", t.name, _CALM_LINK)
-        width = link_width_pt(t.conductance_W_per_K, [x.conductance_W_per_K for x in links])
-        drawn.ax.plot(*zip(*(drawn.middle(end) for end in t.ends), strict=True), color=color, lw=width, zorder=1)
+    for t, width_pt in link_widths_pt(view):
+        drawn.line(t, BLUE if t in at.values() else tints.color("heat", t.name, _CALM_LINK), width_pt)
     above: Counter[object] = Counter()
     for m, place in at.items():
         if place is not None:
@@ -118,8 +115,7 @@ def _place(view: Overview, m: Mark) -> Tie | str | None:
 def _mark(drawn: Drawn, m: Mark, place: Tie | str, above: int) -> None:
     """A frame and a badge, over the badges that the place has already."""
     if isinstance(place, Tie):
-        (x, y), (u, v) = (drawn.middle(end) for end in place.ends)
-        x, y = (x + u) / 2, (y + v) / 2
+        x, y = drawn.halfway(place)
     else:
         patch = (drawn.below if m.kind == "error" else drawn.cards)[place]
         patch.set(edgecolor=BLUE, linewidth=2.6)

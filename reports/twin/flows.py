@@ -150,7 +150,7 @@ def _arrow(drawn: Drawn, t: Tie, watts: float, most_W: float) -> None:
     """From the first body of a link to the second, as wide as its watts; a thin line where nearly nothing flows."""
     a, b = t.ends
     if watts < _LEAST_W:
-        drawn.ax.plot(*zip(drawn.middle(a), drawn.middle(b), strict=True), color="#cdd4db", lw=1.0, zorder=1)
+        drawn.line(t, "#cdd4db", 1.0)
         return
     width = 1.0 + 6.0 * watts / most_W
     drawn.ax.add_patch(

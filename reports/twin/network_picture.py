@@ -62,10 +62,18 @@ class Drawn:
         """The middle of a body's card."""
         return middle(self.cards[name])
 
+    def halfway(self, t: Tie) -> tuple[float, float]:
+        """The point between the two bodies of a link."""
+        (x, y), (u, v) = (self.middle(end) for end in t.ends)
+        return (x + u) / 2, (y + v) / 2
+
+    def line(self, t: Tie, color: str, width_pt: float) -> None:
+        """A link as a line behind the cards."""
+        self.ax.plot(*zip(*(self.middle(end) for end in t.ends), strict=True), color=color, lw=width_pt, zorder=1)
+
     def label(self, t: Tie, text: str, color: str = MUTED) -> None:
         """A text on a link, halfway."""
-        (x, y), (u, v) = (self.middle(end) for end in t.ends)
-        say(self.ax, (x + u) / 2, (y + v) / 2, text, color=color, halo=True)
+        say(self.ax, *self.halfway(t), text, color=color, halo=True)
 
 
 def network_picture(view: Overview) -> Figure:
@@ -77,10 +85,8 @@ def network_picture(view: Overview) -> Figure:
     foot += [f"{s.name}: {s.label}" for s in view.surroundings]
     foot += [chain_label(c) for c in view.chains]
     drawn = arranged(view, cards, foot, f"Thermal network of {view.machine}", counted(view))
-    links = [t for t in view.ties if not t.ground]
-    for t in links:
-        width = link_width_pt(t.conductance_W_per_K, [x.conductance_W_per_K for x in links])
-        drawn.ax.plot(*zip(*(drawn.middle(end) for end in t.ends), strict=True), color=LINK, lw=width, zorder=1)
+    for t, width_pt in link_widths_pt(view):
+        drawn.line(t, LINK, width_pt)
         drawn.label(t, f"{t.conductance_W_per_K:.3g}")
     return drawn.figure
 
@@ -205,7 +211,11 @@ def is_shared(view: Overview, body: str) -> bool:
     return any(t.ground and t.ends[1] == body for t in view.ties)
 
 
-def link_width_pt(g: float, every: Sequence[float]) -> float:
-    """1 to 5.5 points by the logarithm of the conductance."""
-    low, high = math.log(min(every)), math.log(max(every))
-    return 1.0 + (4.5 * (math.log(g) - low) / (high - low) if high > low else 1.5)
+def link_widths_pt(view: Overview) -> list[tuple[Tie, float]]:
+    """The links, each 1 to 5.5 points wide by the logarithm of its conductance."""
+    links = [t for t in view.ties if not t.ground]
+    size = [math.log(t.conductance_W_per_K) for t in links]
+    low, high = min(size, default=0.0), max(size, default=0.0)
+    return [
+        (t, 1.0 + (4.5 * (own - low) / (high - low) if high > low else 1.5)) for t, own in zip(links, size, strict=True)
+    ]
