@@ -141,7 +141,7 @@ class Policy:
     run_windows: int = cost(12, "parts of a run", "in which what happens once is looked for")
     form_places: int = cost(4, "places", "at which products and squares of drivers are looked for")
     free_form_credit: float = development(0.9, "of its gain", "free forms imitate any law to within a tenth")
-    refits: int = cost(10, "refits", "of a round; each takes half a second")
+    refits: int = cost(10, "refits", "of a round; each takes seconds")
     refits_of_mechanism: int = cost(3, "refits", "of one mechanism at several places")
     same_signature_cosine: float = analytic(0.95, "|cos|", "beyond it recordings cannot distinguish two candidates")
     label_swaps: int = cost(1, "pairs", "exchanged labels are rare; the plainest is tried")
@@ -156,7 +156,6 @@ class Policy:
     impossible_min_noises: float = analytic(5.0, "given noises", "by chance one row in two million is so far off")
     impossible_min_rows: int = convention(3, "rows", "a single one may be a fault of the recording")
     unseen_start_sd: float = analytic(2.0, "sd", "by which a body without a sensor may start off")
-    settled: int = cost(4, "refits", "the likeliest, compared under the covariance that is likeliest for each")
     claim_offset: float = development(
         4.17, "log odds", "a logistic fit of 91 claims of 52 cases, 24 of them right: results/claims.csv"
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -93,15 +93,9 @@ def _in_proportion(s: Scored, size: float) -> dict[str, float]:
     return {a: share * (spec.value or 0.0) for a, spec in specs.items()}
 
 
-def starts(s: Scored, now: Point) -> Iterator[tuple[Mapping[str, Value], Mapping[str, float]]]:
-    """Free values and start values of a refit, in the order of trial.
-
-    A linear step may lead to a machine that cannot be simulated, as where heat that feeds itself runs away.
-    """
-    values, at = start_values(s, now)
-    yield values, at
-    for share in POLICY.start_amplitude_shares if s.amplitudes else ():
-        yield start_values(replace(s, amplitudes={a: share * v for a, v in s.amplitudes.items()}), now)
+def free_values(s: Scored, now: Point) -> Mapping[str, Value]:
+    """A candidate's free values with priors; none where it changes a value or exchanges labels."""
+    return start_values(s, now)[0] if s.candidate.mechanism in MECHANISMS else {}
 
 
 def _free(spec: Spec, off: float, begin: float) -> tuple[Value, float]:

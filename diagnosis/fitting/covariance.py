@@ -57,13 +57,15 @@ class Structure:
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """`roots` are, by batch and channel, inverse lower Cholesky factors (n, n) of the blocks; `directions` (n_b, K) by
-    batch, in units of the given noise; `structure` is what it was learned from.
+    """`roots` are, by batch and channel, inverse lower Cholesky factors (n, n) of the blocks, whose sd each channel's
+    `factor` (C,) multiplies; `directions` (n_b, K) by batch, in units of the given noise; `structure` is what it was
+    learned from.
     """
 
     channels: tuple[NDArray[np.int64], ...]
     roots: tuple[dict[int, Array], ...]
     directions: tuple[Array, ...]
+    factor: Array
     drawn: int = 0  # how many of the directions, the first ones, were drawn; the others are imperfections
     structure: Structure | None = None
     share: float = 0.0  # of what draws alone show
@@ -74,13 +76,14 @@ class Covariance:
         channels = tuple(m.channel for m in problem.measured)
         roots = tuple({c: _inverse_root(block(b, c, at)) for c, at in slices_of(m)} for b, m in enumerate(channels))
         bare = tuple(np.zeros((len(m), 0)) for m in channels)
-        return cls(**{"channels": channels, "roots": roots, "directions": bare, **given})
+        ones = np.ones(len(problem.channels))
+        return cls(**{"channels": channels, "roots": roots, "directions": bare, "factor": ones, **given})
 
     def white(self, batch: int, rows: Array) -> Array:
         """Rows (n_b, …) of a batch, uncorrelated and of unit variance but for the directions."""
         out = np.empty(rows.shape)
         for channel, at in self._slices[batch]:
-            out[at] = self.roots[batch][channel] @ rows[at]
+            out[at] = self.roots[batch][channel] @ rows[at] / self.factor[channel]
         return out
 
     @property
@@ -95,12 +98,14 @@ class Covariance:
     @cached_property
     def log_det(self) -> Array:
         """Of every batch's blocks (B,)."""
-        return np.array([-2.0 * sum(float(np.log(np.diag(r)).sum()) for r in own.values()) for own in self.roots])
+        return np.array([
+            -2.0 * sum(float(np.log(np.diag(root) / self.factor[c]).sum()) for c, root in own.items())
+            for own in self.roots
+        ])  # fmt: skip
 
     def scaled(self, factor: Array) -> Covariance:
-        """The same with each channel's (C,) block sd times a factor."""
-        roots = tuple({c: root / factor[c] for c, root in own.items()} for own in self.roots)
-        return replace(self, roots=roots)
+        """The same with each channel's (C,) block sd times this factor; it holds no roots of its own."""
+        return replace(self, factor=factor)
 
 
 def _inverse_root(block: Array) -> Array:

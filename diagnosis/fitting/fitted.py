@@ -17,7 +17,7 @@ from data.errors import InputError, WorkError
 from data.machine import Machine
 from diagnosis.contracts import Fitted, Point, own_step
 from diagnosis.fitting.batches import coarse, spacing_s
-from diagnosis.fitting.carried import carried_nuisances, carried_start, carried_z
+from diagnosis.fitting.carried import carried_nuisances, carried_start, carried_z, on_network
 from diagnosis.fitting.covariance import (
     Covariance,
     Structure,
@@ -85,9 +85,7 @@ def baseline(
     tell, runs = progress or (lambda step, n, of: None), runs or len(batches)
     network, every_s = compile_network(machine, part=part), spacing_s(batches)
     tell("baseline", 1, 3)
-    k = len(network.readings) + len(network.errors)
-    alike = Noise(np.full(k, POLICY.initial_noise_factor), np.full(k, POLICY.initial_rows_per_value))
-    options = FitOptions(max_iterations=POLICY.first_steps, tolerance=POLICY.fit_tolerance_nats)
+    options, alike = _first_calibration(len(network.readings) + len(network.errors))
     lead_rows, problem, state, _ = settled_with_lead(
         machine, lambda lead: CalibrationProblem.of(network, coarse(batches, every_s, lead), every_s), options, alike
     )
@@ -114,7 +112,15 @@ def structured(at: Point, runs: int, seed: int = 0, tell: Callable[[str, int, in
     blocks = list(problem.linearise(at.x, at.nuisance))
     known = beyond_recalibration(blocks, _spread(problem.unknowns), imperfections(at))
     structure = Structure(drawn, known, white_noise(problem))
-    return _learned(at, structure, runs, POLICY.alone_shares, Hyper(*POLICY.first_hyper))
+    covariance, hyper = _likeliest(at, structure)
+    return _learned(at, covariance, hyper, runs)
+
+
+def _first_calibration(channels: int) -> tuple[FitOptions, Noise]:
+    """How a fit descends from the values of the machine file: all channels alike, so that none is neglected."""
+    factor = np.full(channels, POLICY.initial_noise_factor)
+    alike = Noise(factor, np.full(channels, POLICY.initial_rows_per_value))
+    return FitOptions(max_iterations=POLICY.first_steps, tolerance=POLICY.fit_tolerance_nats), alike
 
 
 def on_all_rows(fitted: Fitted, batches: Sequence[Batch]) -> Fitted:
@@ -130,25 +136,45 @@ def on_all_rows(fitted: Fitted, batches: Sequence[Batch]) -> Fitted:
 def relearned(fitted: Fitted) -> Fitted:
     """The fit at its optimum, all derivatives taken anew, under the hyperparameters and the noise of every channel that
     are likeliest now: those of the fit before may have stood in for an effect."""
-    before = fitted.marginal.covariance
-    if before.structure is None:
-        return relinearised(fitted)
-    done = _learned(fitted, before.structure, fitted.runs, (before.share,), fitted.hyper)
-    return replace(done, base=fitted.base) if done.log_evidence > fitted.log_evidence else fitted
+    done = replace(_under_own(fitted, fitted, fitted.hyper), base=fitted.base)
+    return done if done.log_evidence > fitted.log_evidence else fitted
 
 
-def _learned(at: Point, structure: Structure, runs: int, shares: Sequence[float], begin: Hyper) -> Fitted:
-    """The fit under the likeliest covariance. A channel in which no draw shows what it leaves, as where a nut passes a
-    sensor, has more noise."""
-    covariance, hyper = _likeliest(at, structure, shares, begin)
-    fitted, factor = tuned(_fitted(at, covariance, hyper, runs)), np.ones(len(at.problem.channels))
+def afresh(now: Fitted, part: TwinPart) -> Fitted:
+    """The recordings of a fit explained by a changed twin part, from the values of the machine file on.
+
+    The values of a fit that lacks an effect stand in for it. A descent that begins there may end where they still do.
+
+    Raises:
+        InputError: the part does not compile; WorkError: the model fails at the priors' means.
+    """
+    problem = on_network(now.problem, now.batches, compile_network(now.machine, part=part), free_starts=True)
+    options, alike = _first_calibration(len(problem.channels))
+    state, _ = settled(problem, options, noise=alike)
+    at = Point(now.machine, part, now.batches, problem, state.z, state.nuisance, now.lead_rows)
+    return replace(_under_own(now, at, Hyper(*POLICY.first_hyper)), base=now)
+
+
+def _under_own(now: Fitted, at: Point, begin: Hyper) -> Fitted:
+    """A point at its optimum under the structure of a fit, and hyperparameters and noise of its own."""
+    covariance = now.marginal.covariance
+    if covariance.structure is None:
+        return relinearised(_begun(at, covariance, now.hyper, now.runs))
+    given = covariance.scaled(np.ones(len(at.problem.channels)))
+    marginal, columns = _linearised(given, at)
+    return _learned(at, given, marginal.likeliest(marginal.grams(columns), begin)[0], now.runs)
+
+
+def _learned(at: Point, covariance: Covariance, hyper: Hyper, runs: int) -> Fitted:
+    """The fit under a covariance. A channel in which no draw shows what the fit leaves, as where a nut passes a sensor,
+    has more noise."""
+    fitted = tuned(_fitted(at, covariance, hyper, runs))
     for _ in range(POLICY.channel_rounds):
-        new = np.maximum(factor * _excess(fitted), 1.0)
-        change = new / factor
-        if np.abs(np.log(change)).max() < np.log(POLICY.channel_min_excess):
+        before = fitted.marginal.covariance.factor
+        factor = np.maximum(before * _excess(fitted), 1.0)
+        if np.abs(np.log(factor / before)).max() < np.log(POLICY.channel_min_excess):
             break
-        covariance, factor = covariance.scaled(change), new
-        fitted = tuned(_fitted(fitted, covariance, fitted.hyper, runs))
+        fitted = tuned(_fitted(fitted, covariance.scaled(factor), fitted.hyper, runs))
     return fitted
 
 
@@ -176,12 +202,12 @@ def _structure(at: Point, draws: int, rng: np.random.Generator, tell: Callable[[
         return about(replace(at, z=np.clip(at.z, -POLICY.drawn_max_sd, POLICY.drawn_max_sd)))
 
 
-def _likeliest(at: Point, structure: Structure, shares: Sequence[float], begin: Hyper) -> tuple[Covariance, Hyper]:
+def _likeliest(at: Point, structure: Structure) -> tuple[Covariance, Hyper]:
     """The covariance and hyperparameters of the largest marginal likelihood, over the share of what each draw alone
     shows and the sizes of all that is integrated out."""
-    blocks = list(at.problem.linearise(at.x, at.nuisance))
+    blocks, begin = list(at.problem.linearise(at.x, at.nuisance)), Hyper(*POLICY.first_hyper)
     best, most = None, -np.inf
-    for share in shares:
+    for share in POLICY.alone_shares:
         covariance = learned(at.problem, structure, share)
         marginal = _marginal(covariance, blocks, at)
         hyper, likely = marginal.likeliest(marginal.grams(_columns(marginal, blocks, at)), begin)
@@ -190,6 +216,13 @@ def _likeliest(at: Point, structure: Structure, shares: Sequence[float], begin: 
     if best is None:
         raise WorkError(f"machine {at.machine.machine}: the likelihood of its recordings is not finite")
     return best
+
+
+def _linearised(covariance: Covariance, at: Point) -> tuple[Marginal, list[Array]]:
+    """All that acts linearly, and the whitened columns, linearised at a point."""
+    blocks = list(at.problem.linearise(at.x, at.nuisance))
+    marginal = _marginal(covariance, blocks, at)
+    return marginal, _columns(marginal, blocks, at)
 
 
 def _marginal(covariance: Covariance, blocks: Sequence[Block], at: Point) -> Marginal:
@@ -230,9 +263,8 @@ def _fitted(at: Point, covariance: Covariance, hyper: Hyper, runs: int) -> Fitte
 
 def _begun(at: Point, covariance: Covariance, hyper: Hyper, runs: int) -> Fitted:
     """A point under a covariance as it is; all that acts linearly is linearised there."""
-    blocks = list(at.problem.linearise(at.x, at.nuisance))
-    marginal = _marginal(covariance, blocks, at)
-    return Fitted(**_fields(at), marginal=marginal, hyper=hyper, columns=_columns(marginal, blocks, at), runs=runs)
+    marginal, columns = _linearised(covariance, at)
+    return Fitted(**_fields(at), marginal=marginal, hyper=hyper, columns=columns, runs=runs)
 
 
 def _fields(at: Point) -> dict[str, Any]:

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
-
-import numpy as np
 
 from data.errors import InputError, WorkError
 from data.processes import Processes
 from diagnosis.candidates.discretisation import slack
-from diagnosis.candidates.priors import log_odds, starts
+from diagnosis.candidates.priors import free_values, log_odds
 from diagnosis.contracts import Candidate, CandidateKind, Fitted, Scored, Tried
-from diagnosis.fitting.fitted import refitted, relinearised
+from diagnosis.fitting.fitted import afresh
 from diagnosis.localisation.balance import impossible
 from diagnosis.policy import POLICY
 from diagnosis.screening.exchanged import suspected_swaps
@@ -93,21 +90,11 @@ def refits(
 
 
 def refit(now: Fitted, s: Scored) -> Fitted | None:
-    """A fit with one candidate more; None where it cannot be simulated.
-
-    All derivatives are taken anew where those of the fit before lead to less than the screen foretells: an effect moves
-    the values that stood in for it.
-    """
-    if s.candidate.kind is CandidateKind.SENSOR_SWAP:  # the fit was bent towards the wrong labels
-        right = refitted(now, s.candidate.applied(now.part), steps=0)
-        return relinearised(replace(right, z=np.zeros(len(right.z))), POLICY.baseline_steps)
-    for values, begin in starts(s, now):
-        try:
-            fitted = refitted(now, s.candidate.applied(now.part, values), begin)
-            return fitted if fitted.log_evidence - now.log_evidence >= s.gain else relinearised(fitted)
-        except (InputError, WorkError):
-            continue
-    return None
+    """A fit with one candidate more; None where it cannot be simulated."""
+    try:
+        return afresh(now, s.candidate.applied(now.part, free_values(s, now)))
+    except (InputError, WorkError):
+        return None
 
 
 def _usual(c: Candidate, fitted: Fitted, sizes: Mapping[str, float]) -> bool:

@@ -106,31 +106,23 @@ def one_round(
 
 
 def decided(done: Round) -> Round:
-    """A round with its likeliest explanations, and the fit before, each at its own optimum under the covariance that is
-    likeliest for it, and their figures; what alone makes possible what the recordings show comes first."""
-    strange = frozenset(i.channel for i in impossible(done.before))
-    able = [t for t in done.tried if _resolves(t, strange)]
-    likely = [*able, *(t for t in done.tried if t not in able)][: max(POLICY.settled, len(able))]
-    settled = [replace(t, fitted=relearned(t.fitted)) for t in likely]
-    before = _fair(done.before, settled)
-    tried = [_against(before, t) for t in (*settled, *(t for t in done.tried if t not in likely))]
-    if not tried:
+    """A round with what its explanations gain, the likeliest first; what alone makes possible what the recordings show
+    before all."""
+    if not done.tried:
         return done
-    best, *rest = sorted(tried[: len(settled)], key=lambda t: (not _resolves(t, strange), -t.standing))
-    light = {t.candidate.name: t.fitted for t in likely}  # a fit under a covariance of its own holds 100 MB
-    rest = [replace(t, fitted=light[t.candidate.name]) for t in rest]
-    tried = [best, *rest, *sorted(tried[len(settled) :], key=lambda t: -t.standing)]
+    strange = frozenset(i.channel for i in impossible(done.before))
+    before = _fair(done.before, done.tried)
+    tried = [_against(before, t) for t in done.tried]
+    tried.sort(key=lambda t: (not _resolves(t, strange), -t.standing))
     return replace(
         done, before=before, tried=tuple(tried), figures=figures(before, tried), resolved=_resolves(tried[0], strange)
     )
 
 
-def _fair(now: Fitted, settled: Sequence[Tried]) -> Fitted:
-    """The fit before at the best optimum that is known without an effect: what the likeliest refit has found on its
-    way, and would keep without its effect, is no gain of that effect."""
-    if not settled:
-        return now
-    best, first = relearned(now), max(settled, key=lambda t: t.standing)
+def _fair(now: Fitted, tried: Sequence[Tried]) -> Fitted:
+    """The fit before at the best optimum that is known without an effect: what the likeliest explanation has found on
+    its way, and would keep without its effect, is no gain of that effect."""
+    best, first = relearned(now), max(tried, key=lambda t: t.standing)
     with suppress(InputError, WorkError):  # where it has gone with the effect, no machine without it is
         back = relearned(refitted(first.fitted, now.part))
         best = back if back.log_evidence > best.log_evidence else best

@@ -44,7 +44,8 @@ def marginal() -> Marginal:
         {c: np.linalg.inv(np.linalg.cholesky(blocks()[CHANNELS * b + c])) for c in range(CHANNELS)}
         for b in range(BATCHES)
     )
-    covariance = Covariance((channel,) * BATCHES, roots, tuple(problem()["directions"]), drawn=DRAWN)
+    factor = np.ones(CHANNELS)
+    covariance = Covariance((channel,) * BATCHES, roots, tuple(problem()["directions"]), factor, drawn=DRAWN)
     return Marginal(covariance, problem()["own"], [np.zeros(OWN)] * BATCHES, STARTS)
 
 
