@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import datetime as dt
 import math
-import os
 import re
 import sys
-import threading
-import time
-from collections import deque
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from typing import Any, NamedTuple
-from urllib.parse import parse_qs, unquote, urlsplit
 
 from compensation.contracts import Correction, Sample
-from data.errors import InputError, WorkError, closest
+from data.errors import WorkError, closest
 from data.files import from_json
 from data.machine import Machine
 from data.readers.cells import parse_number
@@ -30,90 +24,15 @@ STATES = ("off", "fade-out", "hold", "warm-up", "active")  # from no authority t
 
 _MILLISECONDS_FROM = 1e11  # a Unix time in s reaches this in the year 5138
 _MAX_KEYS = 1000  # of `Reports`: names come from outside, memory must not grow with them
-_INBOX_SIZE = 1000
 _MISSING = ("", "nan", "null", "none")
 
 
-# ----- addresses
+# ----- reports on standard error
 
 
 def shown(address: str) -> str:
     """An address as error lines may show it: without user, password and query."""
     return re.sub(r"//.*@", "//", address, flags=re.DOTALL).partition("?")[0]
-
-
-@dataclass(frozen=True)
-class NetworkAddress:
-    """A parsed ``SCHEME://HOST:PORT/PATH?KEY=VALUE``; `text` is the address without its query."""
-
-    text: str
-    scheme: str
-    host: str
-    port: int
-    path: str
-    query: Mapping[str, str] = field(default_factory=dict)
-
-    @classmethod
-    def parse(cls, address: str, default_port: int, keys: Collection[str], secrets: str) -> NetworkAddress:
-        """Split and check an address; `keys` are the known query keys, `secrets` the start of the variables' names.
-
-        Raises:
-            InputError: a user or password in the address, no host, a wrong port, an unknown or repeated query key.
-        """
-        text = shown(address)
-        parts = urlsplit(address)
-        if "@" in parts.netloc:
-            raise InputError(
-                f"{text}: the address holds a user or a password, expected neither; "
-                f"set {secrets}_USER and {secrets}_PASSWORD in the environment"
-            )
-        try:
-            port = parts.port
-        except ValueError:
-            raise InputError(
-                f"{text}: got the port {parts.netloc.rpartition(':')[2]!r}, expected 1 to 65535; correct it"
-            ) from None
-        if not parts.hostname or "#" in address:
-            got = "'#'" if "#" in address else "no host"
-            raise InputError(f"{text}: got {got}, expected {parts.scheme}://HOST:PORT/PATH; correct the address")
-        try:
-            query = parse_qs(parts.query, keep_blank_values=True, strict_parsing=bool(parts.query))
-        except ValueError:
-            raise InputError(f"{text}: the part after '?' cannot be read; expected KEY=VALUE&KEY=VALUE") from None
-        for key, values in query.items():
-            if key not in keys:
-                raise InputError(f"{text}: unknown key {key!r} after '?': {closest(key, keys)}")
-            if len(values) > 1:
-                raise InputError(f"{text}: key {key!r} stands {len(values)} times after '?'; give it once")
-        path = unquote(parts.path).strip("/")
-        return cls(text, parts.scheme, parts.hostname, port or default_port, path, {k: v[0] for k, v in query.items()})
-
-    def seconds(self, key: str, default_s: float) -> float:
-        """A duration from the query, s.
-
-        Raises:
-            InputError: not a number above 0.
-        """
-        given = self.query.get(key)
-        value = default_s if given is None else parse_number(given)
-        if value is None or value <= 0:
-            raise InputError(f"{self.text}: {key}: got {given!r}, expected a number of seconds above 0; correct it")
-        return value
-
-
-def credentials(secrets: str) -> tuple[str, str | None] | None:
-    """User and password from the environment variables ``SECRETS_USER`` and ``SECRETS_PASSWORD``; None without a user.
-
-    Raises:
-        InputError: a password without a user.
-    """
-    user, password = os.environ.get(f"{secrets}_USER"), os.environ.get(f"{secrets}_PASSWORD")
-    if not user and password:
-        raise InputError(f"{secrets}_PASSWORD is set and {secrets}_USER is not; set both or neither")
-    return (user, password) if user else None
-
-
-# ----- reports on standard error
 
 
 def warn(text: str) -> None:
@@ -306,59 +225,6 @@ def take(
     (readings if target.is_reading else values)[target.channel] = value * target.factor + target.offset
 
 
-# ----- samples that arrive in another thread
-
-
-class Inbox:
-    """Samples on their way from a connector's thread to the runtime; when full, the oldest go, with one report."""
-
-    def __init__(self, where: str, size: int = _INBOX_SIZE) -> None:
-        self._where = where
-        self._samples: deque[Sample] = deque()
-        self._size = size
-        self._changed = threading.Condition()
-        self._closed = False
-        self._full = False
-
-    def put(self, sample: Sample) -> None:
-        """Add a sample; never blocks."""
-        with self._changed:
-            if len(self._samples) >= self._size:
-                self._samples.popleft()
-                if not self._full:
-                    warn(f"{self._where}: {self._size} samples wait, the oldest are dropped; the runtime is too slow")
-                self._full = True
-            self._samples.append(sample)
-            self._changed.notify_all()
-
-    def get(self, timeout_s: float) -> Sample | None:
-        """The oldest sample, or None when none has come in time."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._samples or self._closed, timeout_s)
-            if not self._samples:
-                return None
-            sample = self._samples.popleft()
-            self._full = self._full and bool(self._samples)
-            return sample
-
-    def close(self) -> None:
-        with self._changed:
-            self._closed = True
-            self._samples.clear()
-            self._changed.notify_all()
-
-    @property
-    def closed(self) -> bool:
-        return self._closed
-
-    def samples(self) -> Iterator[Sample | None]:
-        """Samples as they come, None in silence; ends after `close`."""
-        while not self._closed:
-            sample = self.get(IDLE_S)
-            if not self._closed:
-                yield sample
-
-
 # ----- corrections
 
 
@@ -390,8 +256,3 @@ def correction_record(correction: Correction) -> dict[str, Any]:
 def overall_state(correction: Correction) -> str:
     """The state with most authority among the axes: `off` only where every axis is off."""
     return max(correction.state.values(), key=lambda s: STATES.index(s) if s in STATES else -1, default="off")
-
-
-def deadline_s() -> float:
-    """The moment, on the monotonic clock in s, until which a `write` that begins now may wait."""
-    return time.monotonic() + BLOCK_S

@@ -6,11 +6,10 @@ import json
 import socket
 import ssl
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, ClassVar
 from urllib.parse import urlsplit
 
 from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage
@@ -19,28 +18,22 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
 from compensation.connectors.messages import (
-    IDLE_S,
-    Inbox,
+    BLOCK_S,
     Names,
-    NetworkAddress,
     Reports,
-    check_deliverable,
     correction_record,
-    credentials,
-    deadline_s,
     overall_state,
     sample_from_json,
     take,
-    warn,
 )
-from compensation.contracts import Correction, Sample
+from compensation.connectors.network import Delivery, Feed, Link, NetworkAddress, credentials
+from compensation.contracts import Correction
 from data.errors import InputError, WorkError
 from data.machine import Machine
 
 SECRETS = "THERMODRIFT_MQTT"
 KEEPALIVE_S = 5  # the broker sends the last will after 1.5 times this without a sign of life
 COLLECT_S = 1.0
-_POLL_S = 0.1  # between two looks at the end of an interval
 _FIRST_CONNECTION_S = 3.0  # that a new sink waits for its broker, before the first write
 _PORTS = {"mqtt": 1883, "mqtts": 8883}
 _MAX_PAYLOAD_BYTES = 1_000_000
@@ -53,24 +46,20 @@ def prompt_socket(client: Client, userdata: Any, opened: Any) -> None:
         opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
-class _Link:
+class _Link(Link):
     """A client with its thread that connects, and reconnects with a delay that grows from 1 s to 5 s."""
 
-    def __init__(self, address: str, query: tuple[str, ...], on_connected: Callable[[], object] | None = None) -> None:
+    def __init__(self, address: str, query: tuple[str, ...], on_connected: Callable[[], object] = lambda: None) -> None:
         """`query`: known query keys; `on_connected`: what to do at every new connection, in the client's thread."""
         port = _PORTS[urlsplit(address).scheme]
-        self.address = NetworkAddress.parse(address, port, (*query, "ca"), SECRETS)
-        self.where = self.address.text
+        super().__init__(NetworkAddress.parse(address, port, (*query, "ca"), SECRETS))
         self.prefix = self.address.path
         if not self.prefix or any(c in self.prefix for c in "+#\0"):
             raise InputError(
                 f"{self.where}: got the topic prefix {self.prefix!r}, expected one without '+' and '#', such as "
                 f"{self.address.scheme}://{self.address.host}/machine7"
             )
-        self.connected = threading.Event()
         self._on_connected = on_connected
-        self.problem = "not connected yet"
-        self.refused = ""  # by the broker, before any connection: nothing will change by itself
         self.client = Client(CallbackAPIVersion.VERSION2, reconnect_on_failure=True)
         self.client.reconnect_delay_set(1, 5)
         # no limit of its own: paho counts messages that `drop_out_messages` dropped as in flight for ever
@@ -105,42 +94,29 @@ class _Link:
         self, client: Client, userdata: Any, flags: ConnectFlags, reason: ReasonCode, properties: Properties | None
     ) -> None:
         if reason.is_failure:
-            why = f"refused by the broker ({reason}); check {SECRETS}_USER and {SECRETS}_PASSWORD"
-            self.refused = why if self.problem == "not connected yet" else self.refused
-            self._lost(why)
+            self.lost(f"refused by the broker ({reason}); check {SECRETS}_USER and {SECRETS}_PASSWORD", refused=True)
             return
-        self.refused = ""
         client.drop_out_messages()  # corrections of before the loss are out of date
-        if self.problem and self.problem != "not connected yet":
-            warn(f"{self.where}: connected again")
-        self.problem = ""
-        if self._on_connected is not None:
-            self._on_connected()
-        self.connected.set()
+        self._on_connected()
+        self.up()
 
     def _on_connect_fail(self, client: Client, userdata: Any) -> None:
         # paho calls this while it handles the error, and does not hand it over
-        self._lost(f"cannot be reached ({sys.exc_info()[1]})")
+        self.lost(f"cannot be reached ({sys.exc_info()[1]})")
 
     def _on_disconnect(
         self, client: Client, userdata: Any, flags: DisconnectFlags, reason: ReasonCode, properties: Properties | None
     ) -> None:
-        if reason.is_failure and self.connected.is_set():  # else the broker refused it, and the reason is known
-            self._lost(f"connection lost ({reason})")
-        self.connected.clear()
+        if reason.is_failure and self.ready.is_set():  # else the broker refused it, and the reason is known
+            self.lost(f"connection lost ({reason})")
+        self.ready.clear()
 
-    def _lost(self, why: str) -> None:
-        if self.problem in ("", "not connected yet"):  # the later ones are tries to connect again
-            warn(f"{self.where}: {why}; trying again until it works")
-        self.problem = why
-        self.connected.clear()
-
-    def close(self) -> None:
+    def disconnect(self) -> None:
         self.client.disconnect()
         self.client.loop_stop()
 
 
-class MqttSource:
+class MqttSource(Feed):
     """Samples from a broker: ``mqtt://HOST:PORT/PREFIX?interval_s=1``, or ``mqtts://`` with TLS.
 
     | topic | payload |
@@ -162,28 +138,23 @@ class MqttSource:
     """
 
     def __init__(self, address: str, machine: Machine) -> None:
-        self._link = _Link(address, ("interval_s",), self._subscribe)
-        self._interval_s = self._link.address.seconds("interval_s", COLLECT_S)
+        link = _Link(address, ("interval_s",), self._subscribe)
+        super().__init__(link)
+        self._interval_s = link.address.seconds("interval_s", COLLECT_S)
         self._names = Names(machine)
         self._errors = machine.names("error")
-        self._inbox = Inbox(self._link.where)
-        self._payloads = Reports(_REPORTED)
-        self._cells = Reports(_REPORTED)
-        self._lock = threading.Lock()
-        self._values: dict[str, float] = {}
-        self._readings: dict[str, float] = {}
-        self._due_s: float | None = None  # on the monotonic clock
-        self._topics = [f"{self._link.prefix}/{end}" for end in ("sample", "channel/#", "reading/#")]
-        self._link.client.on_message = self._on_message
-        self._link.start()
+        self._payloads, self._cells = Reports(_REPORTED), Reports(_REPORTED)
+        self._prefix, self._client = link.prefix, link.client
+        self._client.on_message = self._on_message
+        link.start()
 
     def _subscribe(self) -> None:
-        self._link.client.subscribe([(topic, 1) for topic in self._topics])
+        self._client.subscribe([(f"{self._prefix}/{end}", 1) for end in ("sample", "channel/#", "reading/#")])
 
     def _on_message(self, client: Client, userdata: Any, message: MQTTMessage) -> None:
         topic = message.topic
-        where = f"{self._link.where}: topic {topic}"
-        kind, _, name = topic.removeprefix(f"{self._link.prefix}/").partition("/")
+        where = f"{self.link.where}: topic {topic}"
+        kind, _, name = topic.removeprefix(f"{self._prefix}/").partition("/")
         try:
             if len(message.payload) > _MAX_PAYLOAD_BYTES:
                 raise ValueError(f"got {len(message.payload)} bytes, expected {_MAX_PAYLOAD_BYTES} at most")
@@ -198,10 +169,7 @@ class MqttSource:
 
     def _whole(self, message: MQTTMessage, where: str) -> None:
         arrival_s = None if message.retain else time.time()
-        sample = sample_from_json(message.payload, self._names, self._cells, where, arrival_s)
-        with self._lock:
-            readings, self._readings = {**self._readings, **sample.readings_um}, {}
-        self._inbox.put(Sample(sample.time_s, sample.values, readings))
+        self.inbox.put(sample_from_json(message.payload, self._names, self._cells, where, arrival_s))
 
     def _single(self, kind: str, name: str, text: str, where: str) -> None:
         target = self._names.of_key(name)
@@ -211,46 +179,10 @@ class MqttSource:
         readings: dict[str, float] = {}
         take(target, name, text, self._names, self._cells, where, values, readings)
         if values or readings:
-            with self._lock:
-                self._values |= values
-                self._readings |= readings
-                if self._due_s is None:
-                    self._due_s = time.monotonic() + self._interval_s
-
-    def _collected(self) -> Sample | None:
-        """The sample of an interval that has ended."""
-        with self._lock:
-            if self._due_s is None or time.monotonic() < self._due_s:
-                return None
-            values, readings = self._values, self._readings
-            self._values, self._readings, self._due_s = {}, {}, None
-        return Sample(time.time(), values, readings) if values or readings else None
-
-    def samples(self) -> Iterator[Sample | None]:
-        """Samples as they arrive, None in silence; ends after `close`.
-
-        Raises:
-            InputError: the broker refuses the first connection.
-        """
-        quiet_from_s = time.monotonic()
-        while not self._inbox.closed:
-            if self._link.refused:
-                raise InputError(f"{self._link.where}: {self._link.refused}")
-            for sample in (self._inbox.get(_POLL_S), self._collected()):
-                if sample is not None and not self._inbox.closed:
-                    yield sample
-                    quiet_from_s = time.monotonic()
-            if time.monotonic() - quiet_from_s >= IDLE_S and not self._inbox.closed:
-                yield None
-                quiet_from_s = time.monotonic()
-
-    def close(self) -> None:
-        """Disconnect; `samples` then ends."""
-        self._inbox.close()
-        self._link.close()
+            self.inbox.collect(values, readings, self._interval_s)
 
 
-class MqttSink:
+class MqttSink(Delivery):
     """Corrections to a broker: ``mqtt://HOST:PORT/PREFIX``, or ``mqtts://`` with TLS (`ca`: see `MqttSource`).
 
     | topic | payload | retained |
@@ -264,69 +196,50 @@ class MqttSink:
 
     All with QoS 1. Plain numbers are not retained, as they carry no time. The broker itself publishes `off` on
     `PREFIX/state` when it hears nothing from the sink for 7.5 s (last will), and `close` does the same; that is no
-    order to send 0, but says that nobody sends. The sink connects again by itself. It never queues: what cannot be
-    delivered at once is dropped, since a late correction is a wrong one.
+    order to send 0, but says that nobody sends. The sink connects again by itself, and never queues.
 
     Raises:
         InputError: an unusable address or certificate.
     """
 
+    peer: ClassVar[str] = "broker"
+
     def __init__(self, address: str, machine: Machine) -> None:
-        self._link = _Link(address, ())
-        self._state_topic = f"{self._link.prefix}/state"
-        self._closed = False
-        self._link.client.will_set(self._state_topic, "off", qos=1, retain=True)
-        self._link.start()
-        self._link.connected.wait(_FIRST_CONNECTION_S)
+        link = _Link(address, ())
+        self._prefix, self._client, self._state_topic = link.prefix, link.client, f"{link.prefix}/state"
+        self._client.will_set(self._state_topic, "off", qos=1, retain=True)
+        link.start()
+        super().__init__(link, _FIRST_CONNECTION_S)
 
-    def write(self, correction: Correction) -> None:
-        """Publish one correction, and wait for the broker's receipt for less than a second.
-
-        Raises:
-            WorkError: not connected, no receipt in time, or a number is not finite.
-        """
-        link, until_s = self._link, deadline_s()
-        check_deliverable(correction, link.where)
-        if self._closed or not link.connected.is_set():
-            raise WorkError(f"{link.where}: {link.problem or 'closed'}; the correction is dropped; check the broker")
-        root = f"{link.prefix}/correction"
-        record = correction_record(correction)
+    def send(self, correction: Correction) -> None:
+        root, record = f"{self._prefix}/correction", correction_record(correction)
         messages = [
             (f"{root}/{_level(axis)}/{key}", str(value), False)
             for key in ("offset_um", "slope_um_per_m", "state")
             for axis, value in record[key].items()
         ]
-        messages.append((f"{link.prefix}/heartbeat", str(correction.heartbeat), False))
+        messages.append((f"{self._prefix}/heartbeat", str(correction.heartbeat), False))
         messages.append((root, json.dumps(record, ensure_ascii=False), True))
         messages.append((self._state_topic, overall_state(correction), True))
+        self._publish(messages)
+
+    def send_off(self) -> None:
+        self._publish([(self._state_topic, "off", True)])
+
+    def _publish(self, messages: Sequence[tuple[str, str, bool]]) -> None:
+        """Topics with text and whether it is retained; what has no receipt in time must not arrive later, after a newer
+        one or after a fade-out."""
+        until_s, why = time.monotonic() + BLOCK_S, "the broker does not confirm a correction in time"
         try:
-            sent = [link.client.publish(topic, text, qos=1, retain=retain) for topic, text, retain in messages]
+            sent = [self._client.publish(topic, text, qos=1, retain=retain) for topic, text, retain in messages]
             for info in sent:
                 info.wait_for_publish(max(0.001, until_s - time.monotonic()))
-            delivered = all(info.is_published() for info in sent)
+            if all(info.is_published() for info in sent):
+                return
         except (RuntimeError, ValueError) as error:
-            self._forget()
-            raise WorkError(f"{link.where}: not delivered ({error}); check the broker") from None
-        if not delivered:
-            self._forget()
-            raise WorkError(f"{link.where}: the broker does not confirm a correction in time; check the broker")
-
-    def _forget(self) -> None:
-        """Drop what waits for a receipt: it must not arrive later, after a newer one or after a fade-out."""
-        self._link.client.drop_out_messages()
-
-    def close(self) -> None:
-        """Publish `off` and disconnect."""
-        if self._closed:
-            return
-        self._closed = True
-        if self._link.connected.is_set():
-            try:
-                self._link.client.publish(self._state_topic, "off", qos=1, retain=True).wait_for_publish(1.0)
-            except (RuntimeError, ValueError) as error:
-                warn(f"{self._link.where}: the state 'off' is not delivered ({error}); check the control")
-        self._forget()
-        self._link.close()
+            why = f"not delivered ({error})"
+        self._client.drop_out_messages()
+        raise WorkError(f"{self.link.where}: {why}; check the broker")
 
 
 def _level(axis: str) -> str:

@@ -7,25 +7,15 @@ import concurrent.futures
 import logging
 import threading
 import time
-from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from compensation.connectors.messages import (
-    BLOCK_S,
-    Inbox,
-    NetworkAddress,
-    Reports,
-    check_deliverable,
-    credentials,
-    excerpt,
-    number,
-    overall_state,
-    warn,
-)
+from compensation.connectors.messages import BLOCK_S, Reports, excerpt, number, overall_state
+from compensation.connectors.network import Delivery, Feed, Link, NetworkAddress, credentials
 from compensation.contracts import Correction, Sample
 from data.errors import InputError, WorkError, closest
 from data.machine import Machine
@@ -101,13 +91,13 @@ def _load_nodes(path: str, machine: Machine, where: str) -> Nodes:
     return nodes
 
 
-class _Link:
+class _Link(Link):
     """A session with a server in a thread with its own event loop; begins again by itself after every loss."""
 
     def __init__(self, address: str, machine: Machine, session: Callable[[Client], Awaitable[None]]) -> None:
-        """`session` runs as long as a connection lasts; it raises when the connection is lost."""
+        """`session` runs as long as a connection lasts; it says when it is `up`, and raises when it is lost."""
         parsed = NetworkAddress.parse(address, _PORT, ("nodes",), SECRETS)
-        self.where = parsed.text
+        super().__init__(parsed)
         if "nodes" not in parsed.query:
             raise InputError(f"{self.where}: no node file; write {self.where}?nodes=FILE.yml")
         self.nodes = _load_nodes(parsed.query["nodes"], machine, self.where)
@@ -115,11 +105,6 @@ class _Link:
         self._url = f"opc.tcp://{host}:{parsed.port}/{parsed.path}".rstrip("/")
         self._user = credentials(SECRETS)
         self._session = session
-        self.ready = threading.Event()  # set by the session
-        self.settled = threading.Event()  # the first try has ended, well or not
-        self.problem = "not connected yet"
-        self.closed = False
-        self._reported = ""
         self._loop: asyncio.AbstractEventLoop | None = None
         self._closing: asyncio.Event | None = None
         self._started = threading.Event()
@@ -144,11 +129,8 @@ class _Link:
             try:
                 await self._until_closing(self._connected(client))
             except Exception as error:  # whatever a broken server causes must not end the thread
-                if self.problem == "":
-                    delay_s = 1.0
-                self._lost(error)
-            self.ready.clear()
-            self.settled.set()
+                delay_s = delay_s if self.problem else 1.0
+                self.lost(" ".join((str(error) or type(error).__name__).split()))
             with suppress(Exception):
                 await asyncio.wait_for(client.disconnect(), 2.0)
             client.disconnect_socket()
@@ -158,21 +140,6 @@ class _Link:
     async def _connected(self, client: Client) -> None:
         await asyncio.wait_for(client.connect(), _CONNECT_S)
         await self._session(client)
-
-    def up(self) -> None:
-        """Note that the session works."""
-        if self._reported:
-            warn(f"{self.where}: connected again")
-        self.problem = self._reported = ""
-        self.ready.set()
-        self.settled.set()
-
-    def _lost(self, error: Exception) -> None:
-        why = str(error) or type(error).__name__
-        self.problem = " ".join(why.split())
-        if not self._reported:  # the later ones are tries to connect again
-            warn(f"{self.where}: {self.problem}; trying again until it works")
-        self._reported = self.problem
 
     async def _until_closing(self, work: Awaitable[None]) -> None:
         """Wait for `work`; stop it when the link closes."""
@@ -202,17 +169,14 @@ class _Link:
         finally:
             future.cancel()
 
-    def close(self) -> None:
-        if self.closed:
-            return
-        self.closed = True
+    def disconnect(self) -> None:
         if self._loop is not None and self._closing is not None:
             with suppress(RuntimeError):  # the loop has ended
                 self._loop.call_soon_threadsafe(self._closing.set)
             self._thread.join(5.0)
 
 
-class OpcUaSource:
+class OpcUaSource(Feed):
     """Samples from a server: ``opc.tcp://HOST:PORT/PATH?nodes=FILE.yml``.
 
     The node file::
@@ -236,9 +200,9 @@ class OpcUaSource:
 
     def __init__(self, address: str, machine: Machine) -> None:
         self._link = _Link(address, machine, self._read_on)
+        super().__init__(self._link)
         if not self._link.nodes.values:
-            raise InputError(f"{self._link.where}: the node file has no values; add values: with channel: node id")
-        self._inbox = Inbox(self._link.where)
+            raise InputError(f"{self.link.where}: the node file has no values; add values: with channel: node id")
         self._cells = Reports()
         self._link.start()
 
@@ -257,7 +221,7 @@ class OpcUaSource:
             readings = {a: v for a, v in measured.items() if last is not None and last.get(a) != v}
             last = {**(last or {}), **measured}
             self._link.up()
-            self._inbox.put(Sample(time_s, values, readings))
+            self.inbox.put(Sample(time_s, values, readings))
             due_s = max(due_s + nodes.interval_s, time.monotonic())
             await asyncio.sleep(due_s - time.monotonic())
 
@@ -268,24 +232,15 @@ class OpcUaSource:
             value = number(held)
             if value is None or (cell.StatusCode is not None and not cell.StatusCode.is_good()):
                 status = cell.StatusCode.name if cell.StatusCode is not None else "no status"
-                where = f"{self._link.where}: node {node_id.to_string()} of {name!r}"
+                where = f"{self.link.where}: node {node_id.to_string()} of {name!r}"
                 self._cells.skipped(name, f"{where}: got {excerpt(held)} ({status}), expected a number")
             else:
                 self._cells.read(name)
                 out[name] = value
         return out
 
-    def samples(self) -> Iterator[Sample | None]:
-        """Samples as they are read, None in silence; ends after `close`."""
-        yield from self._inbox.samples()
 
-    def close(self) -> None:
-        """Disconnect; `samples` then ends."""
-        self._inbox.close()
-        self._link.close()
-
-
-class OpcUaSink:
+class OpcUaSink(Delivery):
     """Corrections to a server: ``opc.tcp://HOST:PORT/PATH?nodes=FILE.yml``.
 
     The node file, next to what `OpcUaSource` reads from it::
@@ -303,12 +258,14 @@ class OpcUaSink:
         valid_until_s: ns=2;s=Comp.Until  # Double: Unix time after which the control holds what it has
 
     The sink writes all of them in one request, the heartbeat last; `close` writes the states `off`. OPC UA has no last
-    will: a control takes the correction back when the heartbeat stands still. The sink connects again by itself. It
-    never queues: what cannot be delivered at once is dropped, since a late correction is a wrong one.
+    will: a control takes the correction back when the heartbeat stands still. The sink connects again by itself, and
+    never queues.
 
     Raises:
         InputError: an unusable address, no node file, an unknown axis or a wrong node id in it, no offsets in it.
     """
+
+    peer: ClassVar[str] = "server"
 
     def __init__(self, address: str, machine: Machine) -> None:
         self._link = _Link(address, machine, self._hold)
@@ -327,7 +284,7 @@ class OpcUaSink:
         self._types: dict[str, ua.VariantType] = {}
         self._axes = Reports()
         self._link.start()
-        self._link.settled.wait(_FIRST_CONNECTION_S)
+        super().__init__(self._link, _FIRST_CONNECTION_S)
 
     async def _hold(self, client: Client) -> None:
         """Find out the nodes' types, then wait until the connection is lost."""
@@ -355,17 +312,8 @@ class OpcUaSink:
         self._link.up()
         await lost
 
-    def write(self, correction: Correction) -> None:
-        """Write one correction, and wait for the server's answer for less than a second.
-
-        Raises:
-            WorkError: not connected, no answer in time, a node that refuses its value, or a number is not finite.
-        """
-        where = self._link.where
-        check_deliverable(correction, where)
-        if self._link.closed or not self._link.ready.is_set():
-            problem = "closed" if self._link.closed else self._link.problem or "not connected"
-            raise WorkError(f"{where}: {problem}; the correction is dropped; check the server")
+    def send(self, correction: Correction) -> None:
+        where = self.link.where
         for axis, offset_um in correction.offset_um.items():
             if offset_um and axis not in self._link.nodes.offsets_um:
                 self._axes.skipped(axis, f"{where}: axis {axis!r} has a correction and no node under offsets_um")
@@ -379,15 +327,18 @@ class OpcUaSink:
         }
         if "heartbeat" in self._wanted:
             given["heartbeat"] = correction.heartbeat % 2 ** _INTEGER_BITS[self._types["heartbeat"].name]
-        self._send(given)
+        self._write(given)
 
-    def _send(self, given: Mapping[str, Any]) -> None:
+    def send_off(self) -> None:
+        self._write({key: "off" for key in self._wanted if key.startswith("state")})
+
+    def _write(self, given: Mapping[str, Any]) -> None:
         """Write values under the keys of `_wanted`; others are left out.
 
         Raises:
             WorkError: see `write`.
         """
-        client, where = self._client, self._link.where
+        client, where = self._client, self.link.where
         keys = [key for key in self._wanted if key in given]
         if client is None or not keys:
             return
@@ -408,12 +359,3 @@ class OpcUaSink:
                     f"{where}: node {node_id.to_string()} of {key} refuses {given[key]!r} ({code.name}); "
                     "make it writable or correct the node file"
                 )
-
-    def close(self) -> None:
-        """Write the states `off` and disconnect."""
-        if not self._link.closed and self._link.ready.is_set():
-            try:
-                self._send({key: "off" for key in self._wanted if key.startswith("state")})
-            except WorkError as error:
-                warn(f"{error}; the state 'off' is not delivered")
-        self._link.close()

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from compensation.connectors import open_sink, open_source
-from compensation.connectors.messages import Inbox, overall_state
+from compensation.connectors.messages import overall_state
+from compensation.connectors.network import Inbox
 from compensation.connectors.streams import CsvSink, CsvSource, StandardInput, StandardOutput
 from compensation.contracts import Correction, Sample, Source
 from data.errors import InputError, WorkError
