@@ -104,7 +104,7 @@ class Covariance:
         ])  # fmt: skip
 
     def scaled(self, factor: Array) -> Covariance:
-        """The same with each channel's (C,) block sd times this factor; it holds no roots of its own."""
+        """The same roots with this factor (C,) in place of its own."""
         return replace(self, factor=factor)
 
 

@@ -96,7 +96,7 @@ def baseline(
     drawn = _structure(at, first, rng, tell)
     covariance = rough(problem, [POLICY.rough_structure_factor / np.sqrt(first) * d for d in drawn])
     tell("baseline", 2, 3)
-    at = _fitted(at, covariance, Hyper(), runs)
+    at = _fitted(_begun(at, covariance, Hyper(), runs))
     tell("baseline", 3, 3)
     return structured(at, runs, seed, tell)
 
@@ -112,8 +112,7 @@ def structured(at: Point, runs: int, seed: int = 0, tell: Callable[[str, int, in
     blocks = list(problem.linearise(at.x, at.nuisance))
     known = beyond_recalibration(blocks, _spread(problem.unknowns), imperfections(at))
     structure = Structure(drawn, known, white_noise(problem))
-    covariance, hyper = _likeliest(at, structure)
-    return _learned(at, covariance, hyper, runs)
+    return _learned(_begun(at, *_likeliest(at, structure), runs))
 
 
 def _first_calibration(channels: int) -> tuple[FitOptions, Noise]:
@@ -160,21 +159,20 @@ def _under_own(now: Fitted, at: Point, begin: Hyper) -> Fitted:
     covariance = now.marginal.covariance
     if covariance.structure is None:
         return relinearised(_begun(at, covariance, now.hyper, now.runs))
-    given = covariance.scaled(np.ones(len(at.problem.channels)))
-    marginal, columns = _linearised(given, at)
-    return _learned(at, given, marginal.likeliest(marginal.grams(columns), begin)[0], now.runs)
+    begun = _begun(at, covariance.scaled(np.ones(len(at.problem.channels))), begin, now.runs)
+    return _learned(replace(begun, hyper=begun.marginal.likeliest(begun.grams, begin)[0]))
 
 
-def _learned(at: Point, covariance: Covariance, hyper: Hyper, runs: int) -> Fitted:
-    """The fit under a covariance. A channel in which no draw shows what the fit leaves, as where a nut passes a sensor,
-    has more noise."""
-    fitted = tuned(_fitted(at, covariance, hyper, runs))
+def _learned(begun: Fitted) -> Fitted:
+    """The fit under the covariance that it begins under. A channel in which no draw shows what the fit leaves, as where
+    a nut passes a sensor, has more noise."""
+    fitted, covariance = tuned(_fitted(begun)), begun.marginal.covariance
     for _ in range(POLICY.channel_rounds):
         before = fitted.marginal.covariance.factor
         factor = np.maximum(before * _excess(fitted), 1.0)
         if np.abs(np.log(factor / before)).max() < np.log(POLICY.channel_min_excess):
             break
-        fitted = tuned(_fitted(fitted, covariance.scaled(factor), fitted.hyper, runs))
+        fitted = tuned(_fitted(_begun(fitted, covariance.scaled(factor), fitted.hyper, fitted.runs)))
     return fitted
 
 
@@ -218,13 +216,6 @@ def _likeliest(at: Point, structure: Structure) -> tuple[Covariance, Hyper]:
     return best
 
 
-def _linearised(covariance: Covariance, at: Point) -> tuple[Marginal, list[Array]]:
-    """All that acts linearly, and the whitened columns, linearised at a point."""
-    blocks = list(at.problem.linearise(at.x, at.nuisance))
-    marginal = _marginal(covariance, blocks, at)
-    return marginal, _columns(marginal, blocks, at)
-
-
 def _marginal(covariance: Covariance, blocks: Sequence[Block], at: Point) -> Marginal:
     return Marginal(covariance, [b.nuisance for b in blocks], at.nuisance, len(at.problem.nuisances.start_K))
 
@@ -252,9 +243,9 @@ def _columns(marginal: Marginal, blocks: Sequence[Block], at: Point) -> list[Arr
     return out
 
 
-def _fitted(at: Point, covariance: Covariance, hyper: Hyper, runs: int) -> Fitted:
-    """A point under a covariance, at its optimum, the batches' own unknowns linearised where they are in that."""
-    begun = _begun(at, covariance, hyper, runs)
+def _fitted(begun: Fitted) -> Fitted:
+    """The fit at its optimum under its covariance, the batches' own unknowns linearised where they are in that."""
+    covariance, hyper, runs = begun.marginal.covariance, begun.hyper, begun.runs
     for _ in range(POLICY.own_rounds):
         done = relinearised(begun, POLICY.baseline_steps)
         begun = _begun(replace(done, nuisance=done.own), covariance, hyper, runs)
@@ -263,8 +254,9 @@ def _fitted(at: Point, covariance: Covariance, hyper: Hyper, runs: int) -> Fitte
 
 def _begun(at: Point, covariance: Covariance, hyper: Hyper, runs: int) -> Fitted:
     """A point under a covariance as it is; all that acts linearly is linearised there."""
-    marginal, columns = _linearised(covariance, at)
-    return Fitted(**_fields(at), marginal=marginal, hyper=hyper, columns=columns, runs=runs)
+    blocks = list(at.problem.linearise(at.x, at.nuisance))
+    marginal = _marginal(covariance, blocks, at)
+    return Fitted(**_fields(at), marginal=marginal, hyper=hyper, columns=_columns(marginal, blocks, at), runs=runs)
 
 
 def _fields(at: Point) -> dict[str, Any]:
@@ -273,7 +265,7 @@ def _fields(at: Point) -> dict[str, Any]:
 
 def under(fitted: Fitted, covariance: Covariance) -> Fitted:
     """The fit under another covariance."""
-    return _fitted(fitted, covariance, fitted.hyper, fitted.runs)
+    return _fitted(_begun(fitted, covariance, fitted.hyper, fitted.runs))
 
 
 Model = Callable[[Array], list[Array]]  # the whitened derivatives (n_b, p) of every batch at z
