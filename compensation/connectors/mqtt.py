@@ -116,7 +116,7 @@ class _Link(Link):
         self.client.loop_stop()
 
 
-class MqttSource(Feed):
+class MqttSource(Feed[_Link]):
     """Samples from a broker: ``mqtt://HOST:PORT/PREFIX?interval_s=1``, or ``mqtts://`` with TLS.
 
     | topic | payload |
@@ -182,7 +182,7 @@ class MqttSource(Feed):
             self.inbox.collect(values, readings, self._interval_s)
 
 
-class MqttSink(Delivery):
+class MqttSink(Delivery[_Link]):
     """Corrections to a broker: ``mqtt://HOST:PORT/PREFIX``, or ``mqtts://`` with TLS (`ca`: see `MqttSource`).
 
     | topic | payload | retained |
@@ -206,10 +206,11 @@ class MqttSink(Delivery):
 
     def __init__(self, address: str, machine: Machine) -> None:
         link = _Link(address, ())
+        super().__init__(link)
         self._prefix, self._client, self._state_topic = link.prefix, link.client, f"{link.prefix}/state"
         self._client.will_set(self._state_topic, "off", qos=1, retain=True)
         link.start()
-        super().__init__(link, _FIRST_CONNECTION_S)
+        link.settled.wait(_FIRST_CONNECTION_S)
 
     def send(self, correction: Correction) -> None:
         root, record = f"{self._prefix}/correction", correction_record(correction)

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, Generic, TypeVar
 from urllib.parse import parse_qs, unquote, urlsplit
 
 from compensation.connectors.messages import IDLE_S, check_deliverable, shown, warn
@@ -188,10 +188,13 @@ class Inbox:
             return sample
 
 
-class Feed:
+L = TypeVar("L", bound=Link)
+
+
+class Feed(Generic[L]):
     """A source: samples that the thread of a link puts into an inbox."""
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: L) -> None:
         self.link, self.inbox = link, Inbox(link.where)
 
     def samples(self) -> Iterator[Sample | None]:
@@ -212,15 +215,13 @@ class Feed:
         self.link.close()
 
 
-class Delivery:
+class Delivery(Generic[L]):
     """A sink: corrections over a link, at once or not at all, since a late correction is a wrong one."""
 
     peer: ClassVar[str]  # what to check where a correction is not delivered
 
-    def __init__(self, link: Link, wait_s: float) -> None:
-        """`wait_s`: for the first connection."""
+    def __init__(self, link: L) -> None:
         self.link = link
-        link.settled.wait(wait_s)
 
     def write(self, correction: Correction) -> None:
         """Deliver one correction, and wait for the receipt for less than a second.

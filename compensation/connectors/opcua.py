@@ -176,7 +176,7 @@ class _Link(Link):
             self._thread.join(5.0)
 
 
-class OpcUaSource(Feed):
+class OpcUaSource(Feed[_Link]):
     """Samples from a server: ``opc.tcp://HOST:PORT/PATH?nodes=FILE.yml``.
 
     The node file::
@@ -199,17 +199,16 @@ class OpcUaSource(Feed):
     """
 
     def __init__(self, address: str, machine: Machine) -> None:
-        self._link = _Link(address, machine, self._read_on)
-        super().__init__(self._link)
-        if not self._link.nodes.values:
+        super().__init__(_Link(address, machine, self._read_on))
+        if not self.link.nodes.values:
             raise InputError(f"{self.link.where}: the node file has no values; add values: with channel: node id")
         self._cells = Reports()
-        self._link.start()
+        self.link.start()
 
     async def _read_on(self, client: Client) -> None:
-        nodes = self._link.nodes
-        value_ids = await self._link.node_ids(client, nodes.values)
-        reading_ids = await self._link.node_ids(client, nodes.readings)
+        nodes = self.link.nodes
+        value_ids = await self.link.node_ids(client, nodes.values)
+        reading_ids = await self.link.node_ids(client, nodes.readings)
         wanted = [*value_ids.values(), *reading_ids.values()]
         last: dict[str, float] | None = None
         due_s = time.monotonic()
@@ -220,7 +219,7 @@ class OpcUaSource(Feed):
             measured = self._numbers(reading_ids, cells[len(value_ids) :])
             readings = {a: v for a, v in measured.items() if last is not None and last.get(a) != v}
             last = {**(last or {}), **measured}
-            self._link.up()
+            self.link.up()
             self.inbox.put(Sample(time_s, values, readings))
             due_s = max(due_s + nodes.interval_s, time.monotonic())
             await asyncio.sleep(due_s - time.monotonic())
@@ -240,7 +239,7 @@ class OpcUaSource(Feed):
         return out
 
 
-class OpcUaSink(Delivery):
+class OpcUaSink(Delivery[_Link]):
     """Corrections to a server: ``opc.tcp://HOST:PORT/PATH?nodes=FILE.yml``.
 
     The node file, next to what `OpcUaSource` reads from it::
@@ -268,10 +267,10 @@ class OpcUaSink(Delivery):
     peer: ClassVar[str] = "server"
 
     def __init__(self, address: str, machine: Machine) -> None:
-        self._link = _Link(address, machine, self._hold)
-        nodes = self._link.nodes
+        super().__init__(_Link(address, machine, self._hold))
+        nodes = self.link.nodes
         if not nodes.offsets_um:
-            raise InputError(f"{self._link.where}: the node file has no offsets_um; add offsets_um: with axis: node id")
+            raise InputError(f"{self.link.where}: the node file has no offsets_um; add offsets_um: with axis: node id")
         self._wanted: dict[str, str] = {
             **{f"offset {axis}": node for axis, node in nodes.offsets_um.items()},
             **{f"slope {axis}": node for axis, node in nodes.slopes_um_per_m.items()},
@@ -283,8 +282,8 @@ class OpcUaSink(Delivery):
         self._node_ids: dict[str, ua.NodeId] = {}
         self._types: dict[str, ua.VariantType] = {}
         self._axes = Reports()
-        self._link.start()
-        super().__init__(self._link, _FIRST_CONNECTION_S)
+        self.link.start()
+        self.link.settled.wait(_FIRST_CONNECTION_S)
 
     async def _hold(self, client: Client) -> None:
         """Find out the nodes' types, then wait until the connection is lost."""
@@ -295,7 +294,7 @@ class OpcUaSink(Delivery):
                 lost.set_exception(ConnectionError(f"connection lost ({error or type(error).__name__})"))
 
         client.connection_lost_callback = on_lost
-        self._node_ids = await self._link.node_ids(client, self._wanted)
+        self._node_ids = await self.link.node_ids(client, self._wanted)
         for key, node_id in self._node_ids.items():
             try:
                 kind = await client.get_node(node_id).read_data_type_as_variant_type()
@@ -309,13 +308,13 @@ class OpcUaSink(Delivery):
                 )
             self._types[key] = kind
         self._client = client
-        self._link.up()
+        self.link.up()
         await lost
 
     def send(self, correction: Correction) -> None:
         where = self.link.where
         for axis, offset_um in correction.offset_um.items():
-            if offset_um and axis not in self._link.nodes.offsets_um:
+            if offset_um and axis not in self.link.nodes.offsets_um:
                 self._axes.skipped(axis, f"{where}: axis {axis!r} has a correction and no node under offsets_um")
         given: dict[str, Any] = {
             **{f"offset {axis}": float(v) for axis, v in correction.offset_um.items()},
@@ -346,9 +345,7 @@ class OpcUaSink(Delivery):
         # without a time stamp: many controls refuse values that have one
         cells = [ua.DataValue(ua.Variant(given[key], self._types[key])) for key in keys]
         try:
-            codes = self._link.call(
-                lambda: client.uaclient.write_attributes(ids, cells, ua.AttributeIds.Value), BLOCK_S
-            )
+            codes = self.link.call(lambda: client.uaclient.write_attributes(ids, cells, ua.AttributeIds.Value), BLOCK_S)
         except (TimeoutError, concurrent.futures.CancelledError):
             raise WorkError(f"{where}: the server does not answer in {BLOCK_S} s; check the server") from None
         except (OSError, RuntimeError, ua.UaError) as error:
