@@ -1,4 +1,4 @@
-"""The comparison of the golden snapshot itself: it must see a changed number, a lost key and a longer list."""
+"""The golden snapshot: the simulation gives the stored numbers, and the comparison sees every kind of difference."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from tests.golden.snapshot import differences
+from tests.golden.snapshot import against_held, differences
 
 
 @pytest.mark.parametrize(
@@ -27,3 +27,8 @@ def test_a_difference_is_located(golden: object, got: object, where: str, size: 
 
 def test_rounding_is_no_difference() -> None:
     assert not list(differences({"a": [1.0, "x", None, True]}, {"a": [1.0 + 1e-12, "x", None, True]}))
+
+
+def test_the_simulation_gives_the_numbers_of_the_file() -> None:
+    """The cheapest section; `python -m tests.golden.snapshot compare` takes the others, which are minutes each."""
+    assert against_held("simulation") == []
