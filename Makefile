@@ -4,7 +4,7 @@ BIN := .venv/bin
 RUN := .venv/.run-ready
 DEV := .venv/.dev-ready
 
-.PHONY: run test test-exam test-slow lint docs gallery prove bench clean lock
+.PHONY: run test test-integration test-exam test-slow lint docs gallery prove bench clean lock
 
 # The diagnosis works on one core, so the demonstration runs while the training does; its lines follow at the end.
 run: $(RUN)  ## the main job on the built-in sample year, and a sealed demonstration of the diagnosis
@@ -13,15 +13,21 @@ run: $(RUN)  ## the main job on the built-in sample year, and a sealed demonstra
 	$(BIN)/thermodrift train --machine machines/sample_vmc.yml --recordings var/sample_year --effort quick \
 	&& { wait $$demonstration; ended=$$?; cat var/demonstration.txt; exit $$ended; }
 
-test: $(DEV)  ## with bytecode, since many tests start processes
-	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+# With bytecode, since many tests start processes.
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+
+test: $(DEV)  ## every test that needs neither a browser nor a server nor minutes
+	$(PYTEST) --dist loadfile -m "not slow and not integration"
+
+test-integration: $(DEV)  ## those with a browser, a server or a whole command: Chromium, Prefect, PostgreSQL, MQTT, OPC UA
+	$(PYTEST) --dist loadfile -m "integration and not slow"
 
 EXAM ?= exam/tests
 test-exam: $(DEV)  ## those of the examination, which no user at a machine runs
-	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(EXAM)
+	$(PYTEST) --dist loadfile $(EXAM)
 
-test-slow: $(DEV)  ## those of both that take minutes, about 35 on two cores; before a release
-	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist load -m slow tests exam/tests
+test-slow: $(DEV)  ## those of both that take minutes, about 35 on two cores, with the integration tests; before a release
+	$(PYTEST) --dist load -m "slow or integration" tests exam/tests
 
 lint: $(DEV)
 	$(BIN)/ruff check .

@@ -23,7 +23,10 @@ from data.errors import InputError, WorkError
 from data.machine import Machine, parse_machine
 
 BROKER = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin")
-pytestmark = pytest.mark.skipif(BROKER is None, reason="needs the broker mosquitto: apt-get install mosquitto")
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.skipif(BROKER is None, reason="needs the broker mosquitto: apt-get install mosquitto"),
+]
 
 TIMEOUT_S = 60.0
 ROOT = Path(__file__).parents[2]

@@ -172,6 +172,7 @@ def delivered(sink: OpcUaSink, correction: Correction = CORRECTION) -> bool:
     return True
 
 
+@pytest.mark.integration
 def test_all_nodes_are_read_together(control: Control, machine: Machine, capsys: pytest.CaptureFixture[str]) -> None:
     source = open_source(control.address, machine)
     sample = taken(source, lambda s: True)
@@ -192,6 +193,7 @@ def test_all_nodes_are_read_together(control: Control, machine: Machine, capsys:
     assert "s=Front of 'front': got None (BadSensorFailure), expected a number" in report
 
 
+@pytest.mark.integration
 def test_a_correction_is_written_with_the_types_of_its_nodes(control: Control, machine: Machine) -> None:
     sink = open_sink(control.address, machine)
     for beat in (0, 1, 255, 256, 257):
@@ -207,6 +209,7 @@ def test_a_correction_is_written_with_the_types_of_its_nodes(control: Control, m
         sink.write(CORRECTION)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("node", "message"),
     [
@@ -223,6 +226,7 @@ def test_a_node_that_takes_no_offset_is_named(control: Control, machine: Machine
     sink.close()
 
 
+@pytest.mark.integration
 @pytest.mark.slow
 def test_source_and_sink_recover_from_a_restart_of_the_server(
     control: Control, machine: Machine, capsys: pytest.CaptureFixture[str]
@@ -246,6 +250,7 @@ def test_source_and_sink_recover_from_a_restart_of_the_server(
     assert "Traceback" not in err
 
 
+@pytest.mark.integration
 def test_a_frozen_server_holds_a_write_up_for_a_bounded_time(control: Control, machine: Machine) -> None:
     sink = open_sink(control.address, machine)
     sink.write(CORRECTION)

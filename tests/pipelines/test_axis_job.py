@@ -91,6 +91,7 @@ def test_the_page_and_the_small_pictures_are_made(result: GridResult, page: Path
     assert "axis coupled" in text
 
 
+@pytest.mark.integration
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium or google-chrome on the path to open the page in")
 def test_no_label_of_a_fan_is_cut_or_covered_in_a_browser(page: Path, tmp_path: Path) -> None:
     _, log = open_page(page, tmp_path)

@@ -29,7 +29,7 @@ from pipelines.store.model_store import predict_frame
 from tests.toys.tracked import log_training
 from tests.toys.training import machine_yaml, toy_batches, toy_model, toy_result
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.integration, pytest.mark.slow]
 PACKAGES = ("mlflow", "numpy", "pandas", "onnxruntime")
 TIMEOUT_S = 120.0
 

@@ -20,6 +20,7 @@ from tests.pipelines.test_compensating import INPUTS, last_recording, store_mode
 from tests.toys.small_year import write_machine, write_year
 
 pytestmark = [
+    pytest.mark.integration,
     pytest.mark.slow,
     pytest.mark.skipif(BROKER is None, reason="needs the broker mosquitto: apt-get install mosquitto"),
 ]

@@ -180,6 +180,7 @@ def warm(year: Path, model: Path, tmp_path: Path) -> tuple[Path, float, dict[str
     return state, last["offset_um"]["z"], {c: float(table[c].iloc[-1]) for c in ("front", "bed")}
 
 
+@pytest.mark.integration
 def test_after_every_end_it_starts_again_from_what_was_sent(
     model: Path, warm: tuple[Path, float, dict[str, float]]
 ) -> None:
@@ -209,6 +210,7 @@ def test_after_every_end_it_starts_again_from_what_was_sent(
         assert set(last.rest()) <= {0.0} and last.process.returncode == (0 if end is None else 128 + end)
 
 
+@pytest.mark.integration
 @pytest.mark.slow  # warm-up lasts a minute
 def test_after_an_end_it_is_active_again_within_the_warm_up(
     model: Path, warm: tuple[Path, float, dict[str, float]]

@@ -14,7 +14,7 @@ import pytest
 from pipelines.fleet.fleet_file import Fleet, FleetMachine, When
 from pipelines.fleet.folders import Folders
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.integration, pytest.mark.slow]
 
 SOON = timedelta(seconds=1)
 

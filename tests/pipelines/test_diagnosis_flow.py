@@ -14,6 +14,8 @@ from pipelines.jobs import diagnosing
 from pipelines.store.tracking import diagnoses
 from tests.toys.diagnoser import Toy, write_machine, write_recordings
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.fixture
 def toy(store_home: Path, monkeypatch: pytest.MonkeyPatch) -> Toy:

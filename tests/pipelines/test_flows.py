@@ -18,6 +18,7 @@ from pipelines.jobs import training
 from pipelines.jobs.request import TrainRequest
 from tests.toys.small_year import write_machine, write_year
 
+pytestmark = pytest.mark.integration
 PLAN = Plan(("none", "correlation"), ("zero", "ridge", "pls"), ("leave-batch-out", "train-on-one"))
 SMALL = Plan(("none",), ("zero", "ridge"), ("leave-batch-out",))
 

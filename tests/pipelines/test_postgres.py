@@ -51,6 +51,7 @@ def write_settings(folder: Path, address: str, artifacts: str = '"{home}/artifac
     (folder / "mlflow.yml").write_text(f'tracking: {{store: "{stored}", artifacts: {artifacts}}}\n{RULE}')
 
 
+@pytest.mark.integration
 def test_a_training_is_tracked_in_postgresql(server: Server, call: Call, tmp_path: Path) -> None:
     write_settings(tmp_path, server.create("tracked"))
     loaded, said = settings.load(), list[str]()
@@ -67,6 +68,7 @@ def test_a_training_is_tracked_in_postgresql(server: Server, call: Call, tmp_pat
     assert tracking.load_training(training_id, loaded).result.cells.equals(result.cells)
 
 
+@pytest.mark.integration
 def test_what_does_not_answer_is_one_line_without_the_password(server: Server, call: Call, tmp_path: Path) -> None:
     address = server.address("nowhere")
     for broken, words in (
@@ -80,6 +82,7 @@ def test_what_does_not_answer_is_one_line_without_the_password(server: Server, c
         assert "://***@127.0.0.1" in done.err and PASSWORD not in done.out + done.err
 
 
+@pytest.mark.integration
 def test_one_process_at_a_time_holds_a_key(server: Server, call: Call, tmp_path: Path) -> None:
     write_settings(tmp_path, server.create("locks"))
     loaded = settings.load()
@@ -113,6 +116,7 @@ def test_an_mlflow_server_that_is_not_there_is_told_at_once(call: Call, tmp_path
         tracking.open_store(loaded)
 
 
+@pytest.mark.integration
 @pytest.mark.slow
 def test_the_yearly_job_on_postgresql(server: Server, call: Call, tmp_path: Path) -> None:
     write_settings(tmp_path, server.create("job"))
@@ -120,6 +124,7 @@ def test_the_yearly_job_on_postgresql(server: Server, call: Call, tmp_path: Path
     assert server.sql("job", "select name from registered_models") == "pg-job-z"
 
 
+@pytest.mark.integration
 @pytest.mark.slow
 def test_the_yearly_job_through_an_mlflow_server(server: Server, call: Call, tmp_path: Path) -> None:
     with mlflow_server(server.create("served"), tmp_path) as address:
@@ -129,6 +134,7 @@ def test_the_yearly_job_through_an_mlflow_server(server: Server, call: Call, tmp
     assert list((tmp_path / "artifacts").rglob("model.json"))
 
 
+@pytest.mark.integration
 @pytest.mark.slow
 def test_two_first_trainings_at_once(server: Server, tmp_path: Path) -> None:
     """Two computers, each with its own home, the same machine and an empty database."""
@@ -153,6 +159,7 @@ def test_two_first_trainings_at_once(server: Server, tmp_path: Path) -> None:
     assert server.sql("twice", "select count(*) from model_versions") == "1"
 
 
+@pytest.mark.integration
 @pytest.mark.slow
 def test_prefects_server_on_postgresql_runs_a_training(server: Server, call: Call, tmp_path: Path) -> None:
     server.create("prefect")

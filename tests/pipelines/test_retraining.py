@@ -12,6 +12,7 @@ import pytest
 from data.errors import WorkError
 from tests.toys.small_year import write_machine, write_year
 
+pytestmark = pytest.mark.integration
 SMALL: dict[str, Any] = {"channels": ["z"], "selectors": ["none"], "families": ["zero", "ridge"]}
 
 

@@ -286,6 +286,7 @@ def test_it_waits_in_little_memory() -> None:
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.integration
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_a_signal_ends_the_command(tmp_path: Path, number: int) -> None:

@@ -22,7 +22,10 @@ ROOT = Path(__file__).parents[2]
 SAMPLE = ROOT / "machines" / "sample_vmc.yml"
 LIMIT_S = 5.0
 STARTED_S = 600.0  # until a moment is reached on a slow computer
-pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="looks for processes below /proc")
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="looks for processes below /proc"),
+]
 Moment = float | Callable[[Command], object]
 
 

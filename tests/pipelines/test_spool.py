@@ -211,6 +211,7 @@ class Interfering(DirectCaller):
         return super().map(step, work, items, retries)
 
 
+@pytest.mark.integration
 @pytest.mark.slow
 @pytest.mark.parametrize("when", ["track", "promote", "within"])
 def test_a_real_server_that_goes_away(when: str, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -67,6 +67,7 @@ class Training:
         return self.process.returncode, time.monotonic() - begun_s, error
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("options", "endless", "number", "group"),
     [

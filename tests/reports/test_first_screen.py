@@ -128,6 +128,7 @@ MEASURE = """<script>addEventListener("load", () => {
 })</script></body>"""
 
 
+@pytest.mark.integration
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium or google-chrome on the path to open the page in")
 @pytest.mark.parametrize(("width_px", "height_px"), [(390, 844), (1400, 900)])
 def test_the_panel_fits_the_first_screen(width_px: int, height_px: int, tmp_path: Path) -> None:
