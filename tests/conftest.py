@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -59,12 +60,20 @@ def quick_looks() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def quick_disk() -> Iterator[None]:
+    """Nothing waits for the disk, which takes tens of ms on a busy computer; no test cuts the power."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda fd: None)
+        yield
+
+
 @pytest.fixture(scope="session")
 def copied_stores(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """From its first use on, a home that a test makes in this process gets a copy of one empty store."""
     from tests.toys import empty_store
 
-    with empty_store.copied_stores(empty_store.empty_store(tmp_path_factory)):
+    with empty_store.quick_commits(), empty_store.copied_stores(empty_store.empty_store(tmp_path_factory)):
         yield
 
 

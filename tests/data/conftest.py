@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from uuid import uuid4
@@ -10,13 +9,6 @@ from uuid import uuid4
 import pytest
 
 S3 = pytest.param("s3", marks=pytest.mark.slow)
-
-
-@pytest.fixture(autouse=True, scope="session")
-def quick_disk() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", lambda fd: None)
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -11,7 +9,6 @@ import pytest
 from diagnosis.diagnose import diagnose
 from diagnosis.fitting.fitted import LeftOutRows, left_out_rows, rows_as_given, worsened
 from diagnosis.localisation.balance import impossible
-from diagnosis.result import Diagnosis
 from tests.diagnosis.small_cases import cold_floor, consistent, fitted, runs, two_bodies
 
 
@@ -27,18 +24,6 @@ def test_a_channel_is_worse_where_its_rise_is_more_than_other_runs_would_make() 
     assert worsened(after, before) == {"t3": (1.0, 2.0)}
 
 
-@pytest.fixture(scope="module")
-def without_link() -> Diagnosis:
-    return unlinked()
-
-
-@cache
-def unlinked() -> Diagnosis:
-    """The file has no link between the bodies, so that nothing warms the head; the recordings know one."""
-    known = two_bodies(links={})
-    return diagnose(known, runs(two_bodies(), count=6))
-
-
 def test_a_part_that_warms_without_heat_is_impossible_and_the_watts_are_stated() -> None:
     known = two_bodies(links={})
     (found,) = impossible(fitted(known, runs(two_bodies(), count=6)))
@@ -51,14 +36,17 @@ def test_what_the_twin_can_do_is_not_impossible() -> None:
     assert impossible(consistent()) == () == impossible(cold_floor())
 
 
-def test_the_missing_path_is_found_and_no_channel_is_worse(without_link: Diagnosis) -> None:
-    answer = without_link.findings
+@pytest.mark.integration
+def test_the_missing_path_is_found_and_no_channel_is_worse() -> None:
+    """The file has no link between the bodies, so that nothing warms the head; the recordings know one."""
+    done = diagnose(two_bodies(links={}), runs(two_bodies(), count=6))
+    answer = done.findings
     assert answer.findings[0].mechanism == "heat_bridge" and answer.findings[0].where.name in ("shaft", "head")
     assert any("t_head warms by" in r for r in answer.remarks)
-    search = without_link.search
+    search = done.search
     assert search is not None
     assert worsened(left_out_rows(search.baseline), left_out_rows(search.final)) == {}
-    assert worsened(rows_as_given(search.baseline), left_out_rows(search.final)) == {} and without_link.added
+    assert worsened(rows_as_given(search.baseline), left_out_rows(search.final)) == {} and done.added
 
 
 def test_the_file_as_given_is_predicted_by_its_own_values() -> None:

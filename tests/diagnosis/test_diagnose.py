@@ -61,7 +61,9 @@ CASES: dict[str, Callable[[], tuple[Machine, list[Batch]]]] = {
     "partly_explained": lambda: (clamped(), clamped_runs({"own": PER_LEVEL_AND_KELVIN, "lamp": LAMP})),
 }
 LONGEST = pytest.param("partly_explained", marks=pytest.mark.slow)
-VERDICTS = [*(v for v in CASES if v != "partly_explained"), LONGEST]
+UNLISTED = pytest.param("unlisted", marks=pytest.mark.integration)
+UNDECIDABLE = pytest.param("undecidable", marks=pytest.mark.integration)
+VERDICTS = ["consistent", "explained", UNDECIDABLE, UNLISTED, LONGEST]
 
 
 @cache
@@ -101,7 +103,7 @@ def test_no_channel_is_predicted_worse_than_before_or_than_by_the_file_as_given(
     assert not done.values or worsened(rows_as_given(done.search.baseline), after) == {}  # noqa: PD011 - no frame
 
 
-@pytest.mark.parametrize("verdict", ["explained", "unlisted", LONGEST])
+@pytest.mark.parametrize("verdict", ["explained", UNLISTED, LONGEST])
 def test_with_what_was_found_only_noise_is_left(verdict: str) -> None:
     rms = diagnosed(verdict).findings.fit.left_out_rms
     for key, after in rms.after.items():
@@ -127,6 +129,7 @@ def test_what_was_found_is_a_part_of_the_machine() -> None:
     assert done.part_before == twin_part(done.machine)
 
 
+@pytest.mark.integration
 def test_an_effect_that_harms_left_out_runs_is_named_and_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
     """The file has the values of a fit without it: recalibrated, nothing added, no value or note of the effect."""
     monkeypatch.setattr("diagnosis.diagnose.harms", lambda before, after: True)
@@ -137,7 +140,7 @@ def test_an_effect_that_harms_left_out_runs_is_named_and_not_written(monkeypatch
     assert set(done.values) and set(done.values) <= names and not done.added and not done.notes
 
 
-@pytest.mark.parametrize("verdict", ["unlisted", LONGEST])
+@pytest.mark.parametrize("verdict", [UNLISTED, LONGEST])
 def test_no_listed_mechanism_is_said_with_its_size(verdict: str) -> None:
     fluxes = [f for f in diagnosed(verdict).findings.findings if f.mechanism == "free_flux"]
     assert len(fluxes) == 1 and "no listed mechanism" in fluxes[0].statement
@@ -166,6 +169,7 @@ def test_part_of_it_has_a_name_of_its_own() -> None:
     assert named[0].parameters["heat"].value == pytest.approx(100.0, rel=0.05)
 
 
+@pytest.mark.integration
 def test_what_cannot_be_told_apart_is_told_together() -> None:
     done = diagnosed("undecidable")
     first = done.findings.findings[0]
@@ -176,6 +180,7 @@ def test_what_cannot_be_told_apart_is_told_together() -> None:
     assert run is None or len(run.separates) > 2
 
 
+@pytest.mark.integration
 def test_what_every_run_shows_is_probable_under_whichever_name() -> None:
     """A switched heat is a cabinet's or a heater's: the probability counts both, and the other name is marked."""
     told = diagnose(clamped("1"), clamped_runs({"own": PUMP}, unit="1")).findings

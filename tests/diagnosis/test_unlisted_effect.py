@@ -36,8 +36,10 @@ def found(given: Case) -> Round:
             "W out of saddle with the square of rpm (at 5000 rpm)",
             marks=[pytest.mark.slow, pytest.mark.xfail(reason="the bed under the saddle is named", strict=True)],
         ),
-        (flux("bed", "rpm", "coolant", cross="0.012 W"), "bed", {"cross": 0.012},
-         "W into bed in proportion to rpm (at 5000 rpm) while coolant is on"),
+        pytest.param(
+            flux("bed", "rpm", "coolant", cross="0.012 W"), "bed", {"cross": 0.012},
+            "W into bed in proportion to rpm (at 5000 rpm) while coolant is on", marks=pytest.mark.integration,
+        ),
         pytest.param(
             flux("bed", "rpm", "coolant", square_cross="3e-6 W"), "bed", {"square_cross": 3e-6},
             "W into bed with the square of rpm (at 5000 rpm) while coolant is on", marks=pytest.mark.slow,
@@ -46,7 +48,10 @@ def found(given: Case) -> Round:
             flux("saddle", None, constant="25 W"), "saddle", {"constant": 25.0}, "W into saddle",
             marks=pytest.mark.slow,
         ),
-        (shift("z", linear="8 um"), "z", {"linear": 8.0}, "µm of z while coolant is on"),
+        pytest.param(
+            shift("z", linear="8 um"), "z", {"linear": 8.0}, "µm of z while coolant is on",
+            marks=pytest.mark.integration,
+        ),
         (shift("y", "column", "rpm", product="0.0005 um/K"), "y", {"product": 0.0005},
          "µm of y per K of column's rise, in proportion to rpm (at 5000 rpm)"),
     ],

@@ -26,6 +26,7 @@ from tests.toys.prefect_stub import Stub, running
 from tests.toys.signalled import Command
 from tests.toys.small_year import write_machine, write_year
 
+pytestmark = pytest.mark.integration
 ITEMS = [1, 2, 3]
 STARTED_S = 120.0  # for the imports of the process on a slow computer
 GONE_S = prefect_process.CRASHED_S + 7.0  # on a busy one
@@ -232,7 +233,6 @@ def test_the_process_ends_with_the_command_though_its_server_is_silent(monkeypat
             forever.set()
 
 
-@pytest.mark.integration
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="looks for processes below /proc")
 def test_nothing_is_left_of_a_command_that_is_killed(tmp_path: Path) -> None:
     """And its run does not go on for ever on the server."""
@@ -254,7 +254,6 @@ def test_nothing_is_left_of_a_command_that_is_killed(tmp_path: Path) -> None:
     assert stub.states("flow_runs") == ["RUNNING", "CRASHED"]
 
 
-@pytest.mark.integration
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="looks for processes below /proc")
 def test_nothing_is_left_where_the_server_is_still_coming_up(tmp_path: Path) -> None:
     write_year(tmp_path / "in")

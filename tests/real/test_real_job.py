@@ -105,6 +105,7 @@ def test_the_lathes_champion_predicts_a_raw_file(lathe: Any) -> None:
     assert not got["simulated"].any()
 
 
+@pytest.mark.integration
 def test_the_spindle_becomes_six_batches_and_is_learned(spindle: Any) -> None:
     assert [r.batch_id for r in spindle.ingested.batches] == [f"spindle_fl-{k:02d}" for k in range(1, 7)]
     assert spindle.ingested.rows_in == len(pd.read_csv(DATA / "spindle_fl" / "spindle_fl.csv"))

@@ -1,8 +1,9 @@
-"""MLflow's empty store, migrated once for all processes of a test run: every migration takes seconds."""
+"""MLflow's empty store, migrated once for all processes of a test run, and written without waiting for the disk."""
 
 from __future__ import annotations
 
 import shutil
+import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 import pytest
 from filelock import FileLock
+from sqlalchemy import Engine, event
 
 from pipelines import settings
 from pipelines.store import database, tracking
@@ -40,3 +42,18 @@ def copied_stores(empty: Path) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(database, "make", copy)
         yield
+
+
+@contextmanager
+def quick_commits() -> Iterator[None]:
+    """No store of this process waits for the disk: a promotion commits dozens of times, and no test cuts the power."""
+
+    def unsafe(connection: Any, _: object) -> None:
+        if isinstance(connection, sqlite3.Connection):
+            connection.execute("PRAGMA synchronous=OFF").close()
+
+    event.listen(Engine, "connect", unsafe)
+    try:
+        yield
+    finally:
+        event.remove(Engine, "connect", unsafe)
