@@ -42,6 +42,7 @@ FOLDERS: Mapping[str, tuple[str, ...]] = {  # a folder may use those before it
     "pipelines": ("store", "jobs", "fleet", "commands"),
 }
 ORCHESTRATION = {"prefect", "mlflow", "typer"}
+TRAINERS = {"features.levenberg_marquardt", "models.numerics.torch_training"}
 PLANTS = {"plants", "thermodrift_exam.plants"}
 PLANTS_MAY_USE = {"data", *PLANTS, "numpy", "scipy", "pandas", "yaml", "skfem"}
 IMPORT_ALL = """
@@ -107,6 +108,11 @@ def test_only_pipelines_imports_what_orchestrates_and_tracks() -> None:
         if other.split(".")[0] in ORCHESTRATION and not name.startswith(("pipelines", "thermodrift_exam.commands"))
     ]
     assert not wrong
+
+
+def test_two_modules_import_torch() -> None:
+    """Without it everything else works, see tests/thermodrift/test_without_torch.py."""
+    assert {name for name, others in graph().items() if any(o.split(".")[0] == "torch" for o in others)} == TRAINERS
 
 
 @pytest.mark.parametrize("room", FOLDERS)

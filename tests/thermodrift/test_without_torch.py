@@ -13,11 +13,9 @@ import pytest
 from data.errors import InputError
 from data.registry import check_packages, packages_reason
 from models.selection.crossing import Plan
-from tests.test_architecture import graph
 from tests.toys.small_year import write_machine, write_year
 
 ROOT = Path(__file__).parents[2]
-TRAINERS = {"features.levenberg_marquardt", "models.numerics.torch_training"}
 HIDDEN = """
 from importlib.machinery import PathFinder
 find = PathFinder.find_spec
@@ -62,10 +60,6 @@ def without_torch(folder: Path, *command: str) -> subprocess.CompletedProcess[st
         [sys.executable, *command], capture_output=True, text=True, cwd=folder, check=False,
         env={**os.environ, "PYTHONPATH": f"{folder / 'hidden'}:{ROOT}", "THERMODRIFT_HOME": str(folder / "home")},
     )  # fmt: skip
-
-
-def test_two_modules_import_torch() -> None:
-    assert {name for name, others in graph().items() if any(o.split(".")[0] == "torch" for o in others)} == TRAINERS
 
 
 def test_a_grid_runs_without_what_needs_torch(tmp_path: Path) -> None:
