@@ -16,10 +16,10 @@ run: $(RUN)  ## the main job on the built-in sample year, and a sealed demonstra
 # With bytecode, since many tests start processes.
 PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
-test: $(DEV)  ## every test that needs neither a browser nor a server nor minutes
+test: $(DEV)  ## every test without a marker
 	$(PYTEST) --dist loadfile -m "not slow and not integration"
 
-test-integration: $(DEV)  ## those with a browser, a server or a whole command: Chromium, Prefect, PostgreSQL, MQTT, OPC UA
+test-integration: $(DEV)  ## those with a browser, a server, a command as a process or a whole diagnosis
 	$(PYTEST) --dist loadfile -m "integration and not slow"
 
 EXAM ?= exam/tests

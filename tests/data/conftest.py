@@ -8,7 +8,7 @@ from uuid import uuid4
 
 import pytest
 
-S3 = pytest.param("s3", marks=pytest.mark.slow)
+S3 = pytest.param("s3", marks=pytest.mark.integration)
 
 
 @pytest.fixture(scope="module")
