@@ -58,6 +58,7 @@ def stated(done: Search) -> dict[str, Interval]:
     return out
 
 
+@pytest.mark.integration
 def test_a_cold_floor_is_found_with_its_size() -> None:
     done = found("floor")
     assert names(done) == ["floor_sink_head_room"]
@@ -65,6 +66,7 @@ def test_a_cold_floor_is_found_with_its_size() -> None:
     assert interval.value == pytest.approx(8.0, rel=0.1)
 
 
+@pytest.mark.integration
 def test_a_claim_is_probable_and_no_channel_is_predicted_worse() -> None:
     for r in found("drift and shift").accepted:
         assert r.best is not None and r.trust >= POLICY.claim_min_probability
@@ -93,6 +95,7 @@ def test_a_drifting_sensor_is_the_sensors_fault() -> None:
     assert interval.low < 0.3 < interval.high
 
 
+@pytest.mark.integration
 def test_of_two_effects_both_are_claimed_each_judged_with_the_other_in_the_model() -> None:
     done = found("drift and shift")
     assert set(names(done)) == {"sensor_drift_t_head", "speed_shift_z_rpm"} and len(done.accepted) == 2
@@ -105,7 +108,7 @@ def test_of_two_effects_both_are_claimed_each_judged_with_the_other_in_the_model
     assert not done.rounds[-1].accepted
 
 
-@pytest.mark.parametrize("case", ["floor", "nothing"])
+@pytest.mark.parametrize("case", [pytest.param("floor", marks=pytest.mark.integration), "nothing"])
 def test_what_any_lumped_network_shows_is_not_tried(case: str) -> None:
     for r in found(case).rounds:
         assert not {t.candidate.name for t in r.tried} & never_reported(proposed(r.before), r.before)
