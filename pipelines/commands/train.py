@@ -140,7 +140,7 @@ def train(
     from models.families import FAMILIES
     from models.protocols import PROTOCOLS
     from models.selection.crossing import FINALISTS, Plan
-    from pipelines.engine import ENGINES, open_engine
+    from pipelines.engine import ENGINES, Engine
     from pipelines.jobs.request import TrainRequest, check_request
 
     one_of(engine, ENGINES, "--engine")
@@ -159,7 +159,7 @@ def train(
         from pipelines.store.tracking import open_store
 
         open_store(configured)
-    chosen = open_engine("direct" if direct else engine, address)
+    chosen = Engine("direct" if direct else engine, address)
     with console.progress(as_json) as (say, done):
         outcome = chosen.train(request, configured, say, done)
     if as_json:

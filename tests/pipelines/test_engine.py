@@ -17,8 +17,8 @@ from data.errors import InputError, WorkError, one_of
 from models.selection.crossing import FamilyResult, Plan, prepare
 from models.selection.grid import Workers
 from models.selection.race import rounds
-from pipelines.caller import DirectCaller
-from pipelines.engine import ENGINES, DirectEngine, open_engine
+from pipelines.caller import LANES, DirectCaller
+from pipelines.engine import Engine
 from pipelines.jobs.request import TrainRequest
 from pipelines.jobs.training import TrainOutcome, train
 from tests.conftest import make_toy_batches
@@ -26,14 +26,14 @@ from tests.toys.command import in_process
 from tests.toys.postgres import free_port
 from tests.toys.small_year import write_machine, write_year
 
-dask_engine = pytest.importorskip("pipelines.dask_engine", exc_type=InputError)
+dask_pools = pytest.importorskip("pipelines.dask_pools", exc_type=InputError)
 PLAN = Plan(("none", "correlation"), ("zero", "ridge", "pls"), ("leave-batch-out", "train-on-one"))
 LONGER = Plan(("none",), ("zero", "ridge", "pls", "random_forest", "huber"), ("leave-batch-out",))
 
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    with dask_engine.Cluster(workers=2) as running:
+    with dask_pools.open_cluster(None, 2) as running:
         yield running
 
 
@@ -48,23 +48,22 @@ def test_an_unknown_engine_or_an_address_without_use_is_one_line(
     assert done.code == 2 and "--direct is --engine direct; got --engine dask" in done.err
     for key in ("direct", "prefect"):
         with pytest.raises(InputError, match=f"--address: engine {key} takes none"):
-            open_engine(key, "tcp://127.0.0.1:8786")
+            Engine(key, "tcp://127.0.0.1:8786")
     with pytest.raises(InputError, match="--address: got 'host:8786', expected that of a Dask scheduler"):
-        open_engine("dask", "host:8786")
-    assert list(ENGINES) == ["prefect", "direct", "dask"]
+        Engine("dask", "host:8786")
 
 
 def test_a_missing_package_names_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    monkeypatch.delitem(sys.modules, "pipelines.dask_engine")
+    monkeypatch.delitem(sys.modules, "pipelines.dask_pools")
     with pytest.raises(InputError, match=r"engine dask: .*run pip install 'thermodrift\[dask\]'"):
-        open_engine("dask")
+        Engine("dask")
 
 
 def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dask_engine, "ANSWER_S", 0.5)
+    monkeypatch.setattr(dask_pools, "ANSWER_S", 0.5)
     with pytest.raises(WorkError, match=r"^Dask cluster tcp://127.0.0.1:\d+: does not answer \([^\n]*\)$"):
-        dask_engine.Cluster(f"tcp://127.0.0.1:{free_port()}").__enter__()
+        dask_pools.open_cluster(f"tcp://127.0.0.1:{free_port()}", 1).__enter__()
 
 
 def test_the_cluster_listens_on_this_computer_alone(cluster: Any) -> None:
@@ -105,16 +104,15 @@ def assert_same(got: FamilyResult, wanted: FamilyResult) -> None:
 
 
 def test_a_worker_with_another_program_is_refused(cluster: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dask_engine, "_program", lambda: {"numpy": "0.1"})
+    monkeypatch.setattr(dask_pools, "_program", lambda: {"numpy": "0.1"})
     with pytest.raises(WorkError, match="a Dask worker has another version of numpy; install the same"):
-        dask_engine.ClusterPool(cluster).submit(len, "abc")()
+        cluster.submit(len, "abc")()
 
 
 def test_what_the_work_raises_is_raised_here(cluster: Any) -> None:
-    pool = dask_engine.ClusterPool(cluster)
-    assert pool.submit(len, "abc")() == 3
+    assert cluster.submit(len, "abc")() == 3
     with pytest.raises(InputError, match="--family: unknown value 'rigde': did you mean 'ridge'"):
-        pool.submit(one_of, "rigde", ("ridge", "pls"), "--family")()
+        cluster.submit(one_of, "rigde", ("ridge", "pls"), "--family")()
 
 
 @pytest.mark.slow
@@ -123,7 +121,7 @@ def test_a_training_on_three_workers_one_of_which_ends(
 ) -> None:
     monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
     ended: list[int] = []
-    with dask_engine.Cluster(workers=3) as three:
+    with dask_pools.open_cluster(None, 3) as three:
 
         def done(step: str, n: int, of: int) -> None:
             if step.startswith("grid") and n == 1:
@@ -131,7 +129,7 @@ def test_a_training_on_three_workers_one_of_which_ends(
                 os.kill(ended[0], signal.SIGKILL)
 
         far = train(request(tmp_path, "engine-dask"), store, DirectCaller(done), pools=three.pools)
-    near = DirectEngine().train(request(tmp_path, "engine-direct"), store)
+    near = Engine("direct").train(request(tmp_path, "engine-direct"), store)
     assert len(ended) == 1
     assert_same_training(far, near, "engine-dask", "engine-direct")
     assert "distributed" not in "".join(capfd.readouterr())
@@ -143,9 +141,9 @@ def test_the_engine_as_prefect_runs_it(
 ) -> None:
     monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
     said: list[str] = []
-    far = dask_engine.DaskEngine(workers=2).train(request(tmp_path, "engine-flow"), store, said.append)
-    near = DirectEngine().train(request(tmp_path, "engine-plain"), store)
-    assert "Dask cluster 127.0.0.1: 2 workers" in said
+    far = Engine("dask").train(request(tmp_path, "engine-flow"), store, said.append)
+    near = Engine("direct").train(request(tmp_path, "engine-plain"), store)
+    assert f"Dask cluster 127.0.0.1: {LANES} workers" in said
     assert_same_training(far, near, "engine-flow", "engine-plain")
 
 
