@@ -11,6 +11,7 @@ import numpy as np
 from data.batch import Batch, Finding
 from data.checks import OF_CELLS, USER
 from data.checks.base import Bools, clock, overrule_line
+from data.recording import DROPPED
 
 LARGE = 0.05  # of a channel's rows in a batch: `ingest` says what masks more
 DECIDES = 0.1  # a result whose deciding channel lost more says so first
@@ -39,6 +40,8 @@ class Account:
     rows_dropped: int
     values: int
     lost: tuple[Lost, ...]
+    reasons: str = ""  # of the rows dropped
+    repeated: int = 0  # rows averaged with another one of the same time
 
     @classmethod
     def of(cls, batches: Iterable[Batch]) -> Account:
@@ -47,15 +50,24 @@ class Account:
         read = sum(b.repairs.get("rows_in", b.n_rows) for b in known)
         dropped = sum(b.repairs.get("rows_dropped", 0) for b in known)
         values = sum(int(np.isfinite(b.values(n)).sum()) for b in known for n in b.channels if n in b.table.columns)
-        return cls(len(known), read, dropped, values, tuple(x for b in known for x in _lost(b)))
+        counts = {why: sum(b.repairs.get(key, 0) for b in known) for key, why in DROPPED.items()}
+        reasons = ", ".join(f"{n} {why}" for why, n in counts.items() if n)
+        repeated = sum(b.repairs.get("duplicates", 0) for b in known)
+        return cls(len(known), read, dropped, values, tuple(x for b in known for x in _lost(b)), reasons, repeated)
+
+    @property
+    def rows(self) -> str:
+        """How many rows were read, dropped and why, and averaged."""
+        why = f" ({self.reasons})" if self.reasons else ""
+        repeated = f", {self.repeated} averaged with another row of the same time" if self.repeated else ""
+        return f"rows: {self.rows_read} read, {self.rows_dropped} dropped{why}{repeated}"
 
     @property
     def summary(self) -> str:
         """One line."""
-        rows = f"rows: {self.rows_read} read, {self.rows_dropped} dropped"
         masked = [x for x in self.lost if x.state == "masked"]
         if not self.lost:
-            return f"{rows}; nothing masked"
+            return f"{self.rows}; nothing masked"
         by = {c: sum(x.rows for x in masked if x.channel == c) for c in dict.fromkeys(x.channel for x in masked)}
         most = sorted(by, key=lambda c: -by[c])[:3]
         named = ", ".join(
@@ -63,7 +75,7 @@ class Account:
         )
         more = f" and {len(by) - 3} more channels" if len(by) > 3 else ""
         missing = sum(x.rows for x in self.lost if x.state == "missing")
-        out = f"{rows}; {sum(by.values())} values masked" + (f": {named}{more}" if by else "")
+        out = f"{self.rows}; {sum(by.values())} values masked" + (f": {named}{more}" if by else "")
         return out + (f"; {missing} cells without a value" if missing else "")
 
     def as_dict(self) -> dict[str, Any]:

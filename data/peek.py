@@ -202,7 +202,7 @@ def _headers(sheet: Sheet, first: int, width: int, form: Form) -> tuple[Sequence
     The units are the row in which most cells are units, the names the one with most different texts, the last of these.
     """
     above = sheet.head[max(0, first - _HEADER_ROWS) : first] if form.header_rows is None else sheet.head[:first]
-    rows = [row for row in above if abs(len(row) - width) <= 1 and _texts(row) >= min(2, width)]
+    rows = [row for row in above if 0.5 * width <= len(row) <= width + 1 and _texts(row) >= min(2, width)]
     units: Sequence[Any] = sheet.units
     if form.units_row is not None:
         units = sheet.head[form.units_row - 1]

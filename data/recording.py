@@ -7,7 +7,7 @@
 | `rows_in` | data rows of the source that belong to this batch (no blank lines, no header, units or title lines) |
 | `rows_used` | source rows that went into at least one value of the grid (a mean, an interpolation, a held driver) |
 | `rows_dropped` | source rows that contributed nothing: the sum of the six reasons below |
-| `ragged_rows` | dropped: too many or too few cells, e.g. a last line that was cut |
+| `ragged_rows` | dropped: too many or too few cells, e.g. a last line that was cut, or above the header |
 | `unparsable_time` | dropped: time empty or unreadable |
 | `time_outliers` | dropped: a lone row whose time is far off |
 | `rows_before_run` | dropped: before the first run of a recording that is cut (counted with the first batch) |
@@ -55,9 +55,14 @@ from data.readers.csv import read_text_table
 from data.readers.header import Layout, NotThisTable, hints, locate
 from data.rows import Rows, cut_runs, gather, stream
 from data.sweeps import Columns, take_readings
-from data.timegrid import check_reduction, repair_time, to_grid
+from data.timegrid import check_step, repair_time, to_grid
 from data.units import check_canonical, conversion, convert
 
+DROPPED = {
+    "ragged_rows": "with another number of cells", "unparsable_time": "without a readable time",
+    "time_outliers": "with a time far off", "rows_before_run": "before the first run",
+    "rows_empty": "without a value", "rows_between": "between two grid points",
+}  # fmt: skip
 _LONGER_SHARE = 0.05
 _LONGER_S = 600.0
 
@@ -360,7 +365,8 @@ class _Samples:
         if len(repaired.order) < 2:
             raise _too_few(rows, len(repaired.order), machine, where)
         if machine.recording.split is None:
-            check_reduction(repaired.time_s, machine.recording.step_s, machine.recording.time.unit, where)
+            recording = machine.recording
+            check_step(repaired.time_s, recording.step_s, recording.time.unit, where, bool(sweeps or machine.axes()))
         untouched = len(repaired.order) == len(rows) and bool((np.diff(repaired.order) == 1).all())
         keep = slice(None) if untouched else repaired.order
         unreadable = sum(len(at) for at, _ in rows.texts.values())
@@ -413,8 +419,7 @@ class _Samples:
             "unparsable_values": self.unreadable,
             **read_counts,
         }
-        reasons = ("ragged_rows", "unparsable_time", "time_outliers", "rows_before_run", "rows_empty", "rows_between")
-        return {"time_s": grid.time_s, **grid.columns}, counts | {"rows_dropped": sum(counts[r] for r in reasons)}
+        return {"time_s": grid.time_s, **grid.columns}, counts | {"rows_dropped": sum(counts[r] for r in DROPPED)}
 
 
 def _batch(rows: Rows, source: _Source, extra: dict[str, int], file_start: float) -> Batch:

@@ -75,7 +75,7 @@ def stream(sheet: Sheet, layout: Layout, machine: Machine, where: str) -> Iterat
     units = {n: c.unit_in_file or c.unit for n, c in machine.channels.items()}
     no_date = pattern is not None and not any(d in pattern for d in ("%d", "%j", "8601"))
     late = np.nan
-    done = 0
+    done, above = 0, layout.above
     for block in sheet.blocks(layout.first_row, positions, text):
         if layout.time is None:  # a row that could not be split is somewhere in its block
             n = len(block.columns[positions[0]])
@@ -96,7 +96,8 @@ def stream(sheet: Sheet, layout: Layout, machine: Machine, where: str) -> Iterat
             )
             if bad is not None:
                 texts[name] = np.flatnonzero(bad), cell_texts(block.columns[position], bad)
-        yield Rows(time_s, values, texts, block.ragged_rows)
+        yield Rows(time_s, values, texts, block.ragged_rows + above)
+        above = 0
 
 
 def _colons(sheet: Sheet, layout: Layout) -> bool:

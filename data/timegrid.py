@@ -35,6 +35,7 @@ _ENDLESS_S = 1e13  # no clock shows this; keeps differences finite
 _EPS = 1e-6  # of a step: 60 s reached by minutes × 60
 _LEAST_ROWS = 12  # of a grid on which the checks find a step
 _SQUEEZED = 10.0  # samples in a grid row
+_FINEST = 2.0  # grid rows for a sample: every other one is interpolated
 _NEAR_STEP = 7.5  # times; units of time are 60 apart
 
 
@@ -110,13 +111,21 @@ def _carry_on(t: Array, step: Array, max_gap_s: float) -> tuple[Array, int]:
     return t, restarts
 
 
-def check_reduction(time_s: Array, step_s: float, unit: str, where: str) -> None:
-    """Refuse a grid that throws most samples of a short recording away: its time unit is probably another one.
+def check_step(time_s: Array, step_s: float, unit: str, where: str, finer: bool) -> None:
+    """Refuse a grid that throws most samples of a short recording away, or that most rows of would be invented.
+
+    `finer` allows the latter, for sweeps.
 
     Raises:
-        InputError: fewer than 12 grid rows, each of more than 10 samples; with the likely unit.
+        InputError: fewer than 12 grid rows, each of more than 10 samples, or a step of less than half of the samples'
+            interval; with the likely unit.
     """
     rows, interval = int(time_s[-1] / step_s + _EPS) + 1, _interval(time_s)
+    if step_s < interval / _FINEST and not finer:
+        raise InputError(
+            f"{where}: rows are {interval:.4g} s apart but recording.step_s is {step_s:g} s: {rows} grid rows from"
+            f" {len(time_s)}; {_other_unit(interval, step_s, unit)}, or raise step_s to {interval:.4g}"
+        )
     if 2 <= rows < _LEAST_ROWS and step_s > _SQUEEZED * interval:
         raise InputError(
             f"{where}: {len(time_s)} rows, {interval:.3g} s apart, span {time_s[-1]:.3g} s and leave only {rows} grid"

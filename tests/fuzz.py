@@ -14,6 +14,7 @@ import itertools
 import json
 import math
 import random
+import re
 import sys
 import tempfile
 import time
@@ -33,7 +34,8 @@ from compensation.contracts import Sample
 from compensation.runtime import Compensator
 from compensation.serving import StateFile, _Line
 from data.errors import InputError
-from data.machine import parse_machine
+from data.machine import Form, parse_machine
+from data.readers.csv import CsvSheet
 from data.recording import read_batches
 
 SLOW_S = 20.0  # on one slow core that is shared
@@ -130,6 +132,12 @@ def _damaged_workbook(good: bytes, dice: random.Random) -> bytes:
     return out.getvalue()
 
 
+def _lines(path: Path) -> int:
+    """Lines of a text file that are not blank."""
+    text = path.read_bytes().decode(CsvSheet(path, (), Form()).encoding, "replace")
+    return sum(bool(line.strip(" ")) for line in re.split("\r\n|\n|\r", text))
+
+
 def _one_line(error: Exception) -> None:
     if len(str(error).splitlines()) > 1:
         raise AssertionError(f"several lines: {error}")
@@ -165,6 +173,11 @@ class Recordings:
                         counts = batch.repairs
                         assert counts["rows_in"] == counts["rows_used"] + counts["rows_dropped"]
                         assert batch.n_rows == counts["rows_out"] >= 2
+                        if suffix in (b".csv", b".txt", b".tsv") and b'"' not in body:
+                            named = (
+                                1 + counts["rows_in"] + sum(counts.get(k, 0) for k in ("preamble_rows", "unit_rows"))
+                            )
+                            assert _lines(path) == named, f"{_lines(path)} lines, {named} in the account"
                 except InputError as error:
                     _one_line(error)
 

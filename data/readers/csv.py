@@ -145,6 +145,7 @@ def _whole(lines: list[str]) -> list[str]:
     return lines
 
 
+_ENDS = re.compile("\r\n|\n|\r")  # one file may mix them
 _TITLE_LINES = 50
 _HEAD_BYTES = 1 << 20
 _BLOCK_BYTES = 4 << 20
@@ -161,15 +162,19 @@ class CsvSheet(Sheet):
             more = bool(file.read(1))
         self.encoding = form.encoding or find_encoding(raw, path.name)
         text = raw.decode(self.encoding, "replace")
-        self._newline = "\n" if "\n" in text or "\r" not in text else "\r"
-        lines = [line.rstrip("\r") for line in text.split(self._newline)]
+        lines = _ENDS.split(text)
         lines = lines[:-1] if (more and len(lines) > 1) or not lines[-1] else lines
         lines = _whole(lines)
         below = [*lines[1:], ""]
         lines = [_COMMENT.sub("", a) if _NUMERIC.match(b) else a for a, b in zip(lines, below, strict=True)]
         self.separator = form.separator or find_separator(lines, hints, (*SEPARATORS, *_BLANKS))
-        self.head = [split(line, self.separator) if line.strip() else [] for line in lines]
+        self.head = [split(line, self.separator) if line.strip(" ") else [] for line in lines]
         self.decimal = form.decimal or find_decimal(self.head)
+        widths = Counter(len(row) for row in self.head if len(row) > 1)
+        width = widths.most_common(1)[0][0] if widths else 1
+        for i, row in enumerate(self.head):
+            if len(row) not in (0, width):
+                self.head[i] = self._refitted(lines[i], width) or row
         self.cut = self._ends_within_a_row()
         self._quoted = '"' in text and self.separator not in _BLANKS
         mark = "point" if self.decimal == "." else "comma"
@@ -179,16 +184,33 @@ class CsvSheet(Sheet):
         """Whether the last line has no end, and fewer cells than the line before it."""
         with self.path.open("rb") as file:
             file.seek(max(0, self.path.stat().st_size - _TAIL_BYTES))
-            lines = file.read().decode(self.encoding, "replace").split(self._newline)
+            lines = _ENDS.split(file.read().decode(self.encoding, "replace"))
         if len(lines) < 3 or not lines[-1].strip():
             return False
         return len(split(lines[-1], self.separator)) < len(split(lines[-2], self.separator))
+
+    def _refitted(self, line: str, width: int) -> list[str] | None:
+        """The `width` cells of a line that another separator divides, or where a note without a digit follows them."""
+        cells = split(line, self.separator)
+        filled = [bool(_NUMERIC.match(cell)) for cell in cells[:width] if cell.strip()]
+        if len(cells) > width and 2 * sum(filled) > len(filled) and not re.search(r"\d", "".join(cells[width:])):
+            return cells[:width]
+        others = [s for s in SEPARATORS if s not in (self.separator, self.decimal)] if len(cells) == 1 else []
+        return next((found for s in others if len(found := split(line, s)) == width > 1), None)
+
+    def _all_refitted(self, lines: bytes, width: int) -> bytes:
+        out, mark = [], "\t" if self.separator in _BLANKS else self.separator
+        for line in lines.decode("utf-8", "replace").split("\n"):
+            cells = self._refitted(line, width) or [line]
+            out.append(mark.join(f'"{cell}"' if mark in cell and len(cells) > 1 else cell for cell in cells))
+        return "\n".join(out).encode()
 
     def blocks(self, first_row: int, positions: Sequence[int], text: Collection[int] = ()) -> Iterator[Block]:
         widths = Counter(len(row) for row in self.head[first_row : first_row + 200] if row)
         if not widths:
             return
-        named = len(self.head[first_row - 1]) if first_row else 0
+        above = self.head[first_row - 1] if first_row else []
+        named = 0 if any(map(_NUMERIC.match, above[:1])) else len(above)
         usual = widths.most_common(1)[0][0]
         width = max(max(positions) + 1, named if 5 * widths[named] > widths.total() else usual)
         for lines in self._bytes(first_row):
@@ -196,7 +218,6 @@ class CsvSheet(Sheet):
 
     def _bytes(self, skip_lines: int) -> Iterator[bytes]:
         """The file below its first lines, as UTF-8 bytes in pieces that end with a line."""
-        end = self._newline.encode()
         blanks = re.compile(_BLANKS.get(self.separator, _BLANKS[" "]).pattern.encode())
         wide = self.encoding.startswith("utf-16")
         decoder = codecs.getincrementaldecoder(self.encoding)("replace") if wide else None
@@ -207,11 +228,13 @@ class CsvSheet(Sheet):
                 raw = file.read(_BLOCK_BYTES)
                 last = len(raw) < _BLOCK_BYTES
                 piece = rest + (decoder.decode(raw, last).encode() if decoder else raw)
-                cut = len(piece) if last else piece.rfind(end) + 1
+                if b"\r" in piece:
+                    piece = piece.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+                cut = len(piece) if last else piece.rfind(b"\n") + 1
                 piece, rest = piece[:cut], piece[cut:]
                 start = 0
                 while skip_lines and start < len(piece):
-                    start = piece.find(end, start) + 1 or len(piece)
+                    start = piece.find(b"\n", start) + 1 or len(piece)
                     skip_lines -= 1
                 piece = piece[start:] if start else piece
                 if not wide and not piece.isascii():
@@ -228,20 +251,21 @@ class CsvSheet(Sheet):
 
     def _parse(self, lines: bytes, width: int, positions: Sequence[int], text: Collection[int]) -> Block:
         names = [f"c{i}" for i in range(width)]
-        rejected: list[None] = []
+        rejected: list[str] = []
 
         def skip(row: Any) -> str:
-            rejected.append(None)
+            if row.text.strip(" "):
+                rejected.append(row.text)
             return "skip"
 
-        def read(types: dict[str, Any]) -> Any:
+        def read(types: dict[str, Any], refitted: bytes | None = None) -> Any:
             rejected.clear()
-            return pc.read_csv(
-                pa.BufferReader(lines),
+            table = pc.read_csv(
+                pa.BufferReader(lines if refitted is None else refitted),
                 read_options=pc.ReadOptions(column_names=names),
                 parse_options=pc.ParseOptions(
                     delimiter="\t" if self.separator in _BLANKS else self.separator,
-                    quote_char='"' if self._quoted else False,
+                    quote_char='"' if self._quoted or refitted else False,
                     invalid_row_handler=skip,
                 ),
                 convert_options=pc.ConvertOptions(
@@ -253,6 +277,8 @@ class CsvSheet(Sheet):
                     check_utf8=False,
                 ),
             )
+            refits = refitted is None and any(self._refitted(text, width) for text in rejected)
+            return read(types, self._all_refitted(lines, width)) if refits else table
 
         wanted = {f"c{i}": pa.string() if i in text else pa.float64() for i in positions}
         try:
@@ -272,11 +298,10 @@ class CsvSheet(Sheet):
 
     def _count(self, lines: bytes, expected: int = -1) -> int:
         """Lines that are not blank; the slow count only where the quick one does not fit."""
-        end = self._newline.encode()
-        quick = lines.count(end) + (not lines.endswith(end))
+        quick = lines.count(b"\n") + (not lines.endswith(b"\n"))
         if quick == expected:
             return quick
-        return sum(1 for line in lines.split(end) if line.strip(b"\r\n"))
+        return sum(1 for line in lines.split(b"\n") if line.strip(b" "))
 
 
 class CsvReader(Reader):

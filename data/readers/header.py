@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -35,6 +36,7 @@ class Layout:
     sweeps: Mapping[str, tuple[tuple[str, float], ...]] = field(default_factory=dict)
     date: int | None = None  # of the dates, where time holds times of day
     origin_s: float = 0.0  # what the wall clock shows more than the clock of the rows
+    above: int = 0  # rows of data above the header
 
 
 def wanted_columns(machine: Machine) -> dict[str, str | int]:
@@ -128,20 +130,59 @@ def locate(sheet: Sheet, machine: Machine, where: str, need_error: bool = True) 
         )
     ignored = (position(int(c) if c.isdigit() else c) for c in machine.ignore)
     known = {*positions.values(), *(p for p in (at, date, *ignored) if p is not None)}
+    unknown = [c for c, i in by_name.items() if i not in known]
+    for name, column in wanted.items():
+        if name not in got_channels and isinstance(column, str) and (meant := _misspelt(column, unknown)):
+            raise InputError(
+                f"{where}: column {column!r} of channel {name!r} is missing; did you mean {str(header[by_name[meant]])!r}?"
+                " Correct column: of the channel, or add that one to ignore"
+            )
     named = sum(bool(str(c or "").strip()) for c in header) if header else width
     first = machine.recording.header_rows
     if first is None:
         first = _first_data_row(sheet, row + 1, at, list(positions.values()), bool(header))
+    over = [r for i, r in enumerate(sheet.head[:first]) if r and i != row]
+    above = sum(_is_row(r, sheet.decimal) for r in over)
+    units = sum(bool(r) and not _is_row(r, sheet.decimal) for r in sheet.head[row + 1 : first]) if header else 0
     counts = {
-        "preamble_rows": max(row, 0) if header else first,
-        "unit_rows": sum(bool(r) for r in sheet.head[row + 1 : first]) if header else 0,
+        "preamble_rows": len(over) - above - units,
+        "unit_rows": units,
         "unknown_columns": max(0, named - len(known)),
         "missing_channels": len(wanted) - len(got_channels),
     }
     origin_s = sheet.origin_s
     if time.unit == "timestamp" and first < len(sheet.head) and at is not None and at < len(sheet.head[first]):
         origin_s = wall_clock_s(sheet.head[first][at])
-    return Layout(first, at, positions, {k: v for k, v in counts.items() if v}, sweeps, date, origin_s)
+    return Layout(first, at, positions, {k: v for k, v in counts.items() if v}, sweeps, date, origin_s, above)
+
+
+def _is_row(row: Sequence[Any], decimal: str) -> bool:
+    """Whether a row above the data is one of data: a clock or number first, and numbers in most other cells."""
+    filled = [c for c in row if c is not None and str(c).strip()]
+    numbers = sum(parse_number(c, decimal) is not None for c in filled[1:])
+    return len(filled) > 1 and _is_clock(filled[0]) and 2 * numbers > len(filled) - 1
+
+
+def _misspelt(column: str, others: Sequence[str]) -> str | None:
+    """The name whose words are those of a column with letters in another order, one more, one less or another one.
+
+    Numbers and words of up to four letters must be the same: they tell sensors and axes apart.
+    """
+    words = _words(column)
+    for other in others:
+        pairs = list(zip(words, theirs := _words(other), strict=False))
+        alike = all(a == b or (min(len(a), len(b)) > 4 and _close(a, b)) for a, b in pairs)
+        if "".join(words) == "".join(theirs) or (alike and len(words) == len(theirs)):
+            return other
+    return None
+
+
+def _words(name: str) -> list[str]:
+    return re.findall(r"[^\W\d_]+|\d+", normalise(name))
+
+
+def _close(one: str, other: str) -> bool:
+    return one.isalpha() and difflib.SequenceMatcher(None, one, other).ratio() >= 0.75
 
 
 def _some(names: Sequence[str], n: int = 3) -> str:

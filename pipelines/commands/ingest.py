@@ -86,8 +86,11 @@ def ingest(
     else:
         print_ingest(report)
         print_findings(finding_table((r.batch_id, r.found) for r in report.batches))
-    for line in Account.of(load_batches(home_lake(), described)).large(stored) if stored else ():
-        console.note(line)
+    if stored:
+        batches = load_batches(home_lake(), described)
+        new = Account.of(b for b in batches if b.batch_id in stored)
+        for line in ([new.rows] if new.rows_dropped or new.repeated else []) + Account.of(batches).large(stored):
+            console.note(line)
     if not report.rows:
         raise InputError(
             f"{', '.join(map(str, paths))}: no recording there, {len(report.ignored)} other files; the machine file "
