@@ -159,7 +159,10 @@ def _write(groups: Sequence[Group], left_out: Sequence[str], others: set[str]) -
         assert group.joint is not None
         keys = {**group.joint.keys, **({} if group.table.header else {"header": False})}
         lines += ["  joined:"] * (k == 0) + [f"    {group.key}:  # guessed: {group.joint.why}"]
-        lines += [f"      {line}" for line in (*(f"{n}: {flow(v)}" for n, v in keys.items()), *_layout(group))]
+        layout = _layout(group)
+        if main.table.time is None and group.table.time is None:
+            layout.pop()  # the recording's step is theirs
+        lines += [f"      {line}" for line in (*(f"{n}: {flow(v)}" for n, v in keys.items()), *layout)]
     lines += ["channels:", *channels]
     if ignored := dict(left for g in groups for left in _left(g)):
         lines.append(f"ignore: {flow([*ignored])}  # guessed: {'; '.join(ignored.values())}")
@@ -183,7 +186,7 @@ def _left(group: Group) -> list[tuple[str, str]]:
 def _steps(groups: Sequence[Group], fine_s: float) -> list[str]:
     """The lines of the grid. The recordings, the first group, set its step; sweeps need `fine_s`, inf without any."""
     if groups[0].table.time is None:
-        return ["  step_s: 60  # fill in: time.step in seconds, or a coarser grid"]
+        return []  # the rows are the grid
     intervals_s = [g.step_and_length[0] * g.clock.unit_s for g in groups if g.table.time is not None]
     step_s = guess.grid_step_s(intervals_s[0])
     slowest_s = guess.grid_step_s(max(intervals_s))

@@ -25,7 +25,7 @@ from data.readers.csv import normalise
 from data.readers.header import Layout
 from data.rows import Rows, join, stream
 from data.timegrid import repair_time
-from data.units import TIME_UNITS_S, quantity, stated_unit
+from data.units import TIME_UNITS_S, plain, quantity, stated_unit
 from data.yaml_edit import flow
 
 FILL_IN = "? s"  # in place of the step of a recording without a clock
@@ -90,10 +90,7 @@ class Group:
         return names
 
     def _slug(self, i: int) -> str:
-        column = self.table.columns[i]
-        if not self.table.header:
-            return f"column_{i}"
-        return re.sub(r"[^\w]+", "_", column if column.isascii() else normalise(column)).strip("_") or f"column_{i}"
+        return re.sub(r"[^\w]+", "_", plain(guess.without_unit(self.table.title(i)))).strip("_") or f"column_{i}"
 
     @cached_property
     def rows(self) -> list[Rows]:
@@ -158,13 +155,16 @@ class Group:
         units = {n: unit.value if (unit := self.unit(i)) else None for n, i in self.names.items()}
         roles = {n: guess.role(headers[n], units[n], self.longest.columns[n]) for n in self.names}
         open_ = [n for n, r in roles.items() if r.value != "error" and guess.may_be_error(headers[n], units[n])]
+        open_ = open_ or [n for n, r in roles.items() if r.value == "position" and units[n] is None]
         if any(r.value == "error" for r in roles.values()):
             asked = [f"{n} ({units[n]})" for n in open_ if roles[n].value == "driver"]
             if asked:
                 self.notes.append(f"{', '.join(asked)}: taken for drivers; set role: error if one is measured")
         elif len(open_) == 1:
-            self.notes.append(f"{open_[0]} ({units[open_[0]]}) is taken for the measured error; else set its role")
-            roles[open_[0]] = Guess("error", f"the only channel that can be it, by its unit {units[open_[0]]}")
+            unit = units[open_[0]]
+            self.notes.append(f"{open_[0]} ({unit or 'no unit'}) is taken for the measured error; else set its role")
+            by = f"unit {unit}" if unit else "name"
+            roles[open_[0]] = Guess("error", f"the only channel that can be it, by its {by}")
         else:
             shown = open_ or [n for n, r in roles.items() if r.value == "driver"] or [*roles]
             self.notes.append(
@@ -206,17 +206,18 @@ class Group:
         return Clock(f"{{column: {column}, unit: {unit.value}}}", unit.why, unit_s, note)
 
     def _summer_time(self) -> str:
-        """What to check where stamps without a zone jump by an hour in a night of March or April, else nothing."""
+        """What to check where stamps without a zone jump back by an hour, or forward in a night of March or April."""
         if self.table.form.timezone:
             return ""
         for rows in self.rows:
             step_s = np.diff(rows.time_s)
             usual = float(np.nanmedian(step_s)) if len(step_s) else 0.0
-            for at in np.flatnonzero(np.abs(step_s - usual - 3600.0) < 0.5 * usual):
-                when = dt.datetime.fromtimestamp(rows.time_s[at] + usual, dt.UTC)
-                if when.month in (3, 4) and when.weekday() == 6 and when.hour < 4:
+            for at in np.flatnonzero(np.abs(np.abs(step_s - usual) - 3600.0) < 0.5 * usual):
+                when, back = dt.datetime.fromtimestamp(rows.time_s[at] + usual, dt.UTC), step_s[at] < 0
+                if back or (when.month in (3, 4) and when.weekday() == 6 and when.hour < 4):
+                    way, end = ("back by an hour", "end") if back else ("by an hour", "start")
                     return (
-                        f"the clock jumps by an hour at {when:%Y-%m-%d %H:%M}, as at the start of summer time; if so, "
+                        f"the clock jumps {way} at {when:%Y-%m-%d %H:%M}, as at the {end} of summer time; if so, "
                         "set recording.timezone, such as Europe/Berlin"
                     )
         return ""

@@ -16,8 +16,8 @@ from data.sweeps import position_bins
 from data.units import TIME_UNITS_S, known_unit, quantity, stated_unit
 
 _TIME = re.compile(
-    r"time|zeit|时间|時間|时刻|時刻|日時|日期|elapsed|datum|date|^t$|^t ?[\[(/]|\btemps\b(?! ?\d)|heure|horodat|tiempo|"
-    r"fecha|\bhora\b|\btempo\b|\bora\b|\bdata\b"
+    r"time|\bclock$|zeit|时间|時間|时刻|時刻|日時|日期|elapsed|datum|date|^t$|^t ?[\[(/]|\btemps\b(?! ?\d)|heure|"
+    r"horodat|tiempo|fecha|\bhora\b|\btempo\b|\bora\b|\bdata\b"
 )
 _COUNTER = re.compile(
     r"^(unnamed: 0|#|no|nr|n°|nº|num|number|nummer|numero|numéro|número|index|idx|indice|índice|id|row|zeile|ligne|"
@@ -35,7 +35,8 @@ _DRIVER = re.compile(
     r"rpm|speed|drehzahl|转速|轉速|回転|feed|vorschub|進給|进给|power|leistung|current|strom|load|heater|"
     r"^q\d|torque|pump|flow|volt|humid|feucht|press|druck"
 )
-_TEMPERATURE = re.compile(r"temp|^t[a-z]? ?\d|^pt ?\d|thermo|温")
+_TEMPERATURE = re.compile(r"temp|^t[a-z]? ?\d|^pt ?\d|\bt$|thermo|温")
+_ALARM = re.compile(r"alarm|warning|fault|störung")
 _POSITION = re.compile(r"\bpos|axis|achse")
 _LONE_LETTERS = {"W", "A", "V", "N", "C", "K", "%", "°", "℃"}
 _LABELS = ("A", "W", "N")  # letters of sensors rather than units where the name is one of a temperature
@@ -91,6 +92,18 @@ def is_series_name(name: str) -> bool:
 def is_value_name(name: str) -> bool:
     """Whether a header is one of a column of readings of any kind."""
     return bool(_VALUE.match(normalise(name)))
+
+
+def no_quantity(name: str) -> str:
+    """What a header names that is no quantity: an alarm, or the fraction of a clock by its unit alone; else nothing."""
+    if _ALARM.search(normalise(name)):
+        return "an alarm"
+    return "a part of the clock" if known_unit(name) in ("ms", "us", "ns") else ""
+
+
+def without_unit(name: str) -> str:
+    """A header without the brackets that hold its unit."""
+    return _BRACKETS.sub(lambda found: "" if stated_unit(found[1]) else found[0], name)
 
 
 def is_other_name(name: str) -> bool:
@@ -273,6 +286,14 @@ def time_unit(written: str | None, step: float, length: float, rate_K: float) ->
     if len(fits) > 1:
         note += f"; {' and '.join(fits[1:])} would be plausible as well"
     return Guess(value, f"{seen} fit {value}"), note
+
+
+def unit_doubt(unit: str, step_s: float, length_s: float, rate_K_per_s: float) -> str:
+    """What speaks against the unit of a clock that gave these, where two things do and nothing against another unit."""
+    factors = {u: s / TIME_UNITS_S[unit] for u, s in TIME_UNITS_S.items()}
+    doubts = {u: _doubts(step_s * f, length_s * f, rate_K_per_s / f) for u, f in factors.items()}
+    fits = [u for u, d in doubts.items() if not d]
+    return f"{unit} gives {' and '.join(doubts[unit])}; {fits[0]} would not" if len(doubts[unit]) > 1 and fits else ""
 
 
 def _doubts(step_s: float, length_s: float, rate_K_per_s: float) -> list[str]:

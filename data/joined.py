@@ -42,6 +42,8 @@ def joined_machine(machine: Machine, key: str) -> Machine:
     part = machine.recording.joined[key]
     form = {k: getattr(part, k) for k in Form.model_fields}
     form["timezone"] = part.timezone or machine.recording.timezone
+    if machine.recording.time.step is not None and "time" not in part.model_fields_set:
+        form["time"] = machine.recording.time
     recording = machine.recording.model_copy(update={**form, "joined": {}, "split": None, "schedule": None})
     channels = {
         n: c.model_copy(update={"source": "file"})

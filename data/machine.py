@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import unicodedata
 from collections.abc import Mapping
 from pathlib import Path
@@ -202,13 +203,23 @@ class Recording(Form):
 
     files: list[str] = ["*.csv", "*.xlsx", "*.parquet", "*.txt"]  # patterns inside a directory
     step_s: Annotated[float, Field(gt=0)] = 60.0  # of the regular grid in the lake
-    max_gap_s: Annotated[float, Field(gt=0)] = 300.0  # a longer hole stays a hole
+    max_gap_s: Annotated[float, Field(gt=0)] = 300.0  # a longer hole stays one; slower channels: 2.5 intervals
     start_from_name: str | None = None  # strptime pattern of the file's stem or its sheet, e.g. "%Y%m%d"
     order: Literal["name"] | list[str | int] | None = None  # of runs without a start: by id, or the ids, earliest first
     split: Split | None = None  # one long recording into runs
     schedule: Schedule | None = None  # drivers from a table
     joined: dict[str, Joined] = {}  # further files or sheets of the same runs, by a name of your choice
     drivers: Drivers | None = None  # what a row shows of a driver; default: learned
+
+    @model_validator(mode="before")
+    @classmethod
+    def _grid_of_rows(cls, given: Any) -> Any:
+        """Without a clock and a grid of their own, the rows are the grid."""
+        time = given.get("time") if isinstance(given, dict) else None
+        with contextlib.suppress(ValueError, KeyError, TypeError):  # the keys' own checks report it
+            step_s = seconds(time["step"])
+            return {"step_s": step_s, "max_gap_s": 5 * step_s, **given}
+        return given
 
 
 class ChannelPart(Section):

@@ -20,8 +20,9 @@ from data.errors import InputError
 from data.machine import Form, Pivot, TimeColumn
 from data.readers import sheets_of
 from data.readers.base import Sheet
-from data.readers.cells import cell_unit, is_elapsed, parse_number, stamp_formats, to_seconds, with_date
+from data.readers.cells import MISSING, cell_unit, is_elapsed, parse_number, stamp_formats, to_seconds, with_date
 from data.readers.csv import normalise
+from data.readers.pivot import MOST_NAMES
 from data.readers.xlsx import arrow_column
 from data.units import stated_unit
 
@@ -137,15 +138,19 @@ def _look_at(sheet: Sheet, where: str, form: Form) -> Table:
             continue
         if i in clock.counters:
             left[i] = "numbers the rows, or is another clock"
-        elif not cells:
-            left[i] = "empty"
+        elif header and (why := guess.no_quantity(columns[i])):
+            left[i] = why
+        elif all(str(c).strip() in MISSING for c in some):
+            left[i] = "empty or NaN" if cells else "empty"
         elif numbers <= _LEAST_NUMBERS * len(some):
             time = bool(header) and guess.is_time_name(columns[i]) and clock.time is None
             left[i] = f"{'a time in no known format' if time else 'text'}, such as {str(cells[0])[:30]!r}"
         else:
             numeric.append(i)
-    if not numeric:
-        raise InputError(f"{where}: no numeric column in addition to the time column; record channels")
+    if not 0 < len(numeric) <= MOST_NAMES:
+        why = ", ".join(f"{columns[i]} ({text})" for i, text in [*left.items()][:4])
+        got = f"{len(numeric)} columns of numbers" if numeric else f"no column of numbers next to the clock: {why}"
+        raise InputError(f"{where}: {got}; expected 1 to {MOST_NAMES} channels of a machine; export those")
     return Table(
         tuple(columns), tuple(stated), bool(header), first, clock, tuple(numeric), left,
         tuple(tuple(row[i] for row in body[:_SHOWN_ROWS]) for i in range(width)), sheet.summary, form,
@@ -167,11 +172,20 @@ def _first_row(sheet: Sheet, where: str, form: Form) -> int:
     if first is not None and len(sheet.head[first]) != usual:
         first = next((i for i in starts if len(sheet.head[i]) == usual), first)
     if first is None:
-        raise InputError(
-            f"{where}: no table of numbers found; expected a time column and channels; it was read as {sheet.summary}:"
-            " give separator and header_rows (lines above the data), or export it as CSV"
-        )
+        raise InputError(f"{where}: {_why_no_table(sheet)}")
     return first
+
+
+def _why_no_table(sheet: Sheet) -> str:
+    filled = sum(_texts(row) > 0 for row in sheet.head)
+    rows = sum(any(_kind(c, sheet.decimal) == "n" for c in row) for row in sheet.head)
+    if filled < 2 or rows == 1:
+        found = "one row of numbers" if rows else "no row below its first line" if filled else "nothing, it is blank"
+        return f"the table holds {found}; expected at least 2 rows below the names; record or copy it again"
+    return (
+        f"no table of numbers found; expected a time column and channels; it was read as {sheet.summary}:"
+        " give separator and header_rows (lines above the data), or export it as CSV"
+    )
 
 
 def _is_data(sheet: Sheet, i: int) -> bool:
@@ -283,7 +297,8 @@ def _clock(
     named = [i for i, c in enumerate(columns) if header and guess.is_time_name(c)]
     counters: list[int] = []
     ticking: list[int] = []
-    found: list[tuple[float, int, tuple[str, ...], bool]] = []  # share of rising steps (1 more: named), place, …
+    # named, rises nearly always, shows times, share of rising steps, place, …: a clock set back, not its tick counter
+    found: list[tuple[bool, bool, bool, float, int, tuple[str, ...], bool]] = []
     for i, (column, cells) in enumerate(zip(columns, filled, strict=True)):
         if len(cells) < 2 or (header and i not in named and guess.is_other_name(column)):
             continue
@@ -292,7 +307,12 @@ def _clock(
         elapsed = is_elapsed(cells)
         if len(numbers) >= _MOST * len(cells):
             steps = np.diff(np.array(numbers))
-            if header and i not in named and guess.is_counter_name(column) and bool((steps == 1).all()):
+            if (
+                header
+                and i not in named
+                and guess.is_counter_name(column)
+                and np.mean((steps == 0) | (steps == 1)) > _MOST
+            ):
                 counters.append(i)
                 continue
             if header and bool((steps > 0).all()) and np.ptp(steps) <= 1e-6 * steps[0]:
@@ -305,10 +325,11 @@ def _clock(
         else:
             continue
         if _goes_on(steps) if i in named or stamps or elapsed else _ticks(steps):
-            found.append((float(np.mean(steps > 0)) + (i in named), -i, stamps, elapsed))
+            rises = float(np.mean(steps > 0))
+            found.append((i in named, rises > _MOST, bool(stamps) or elapsed, rises, -i, stamps, elapsed))
     if not found:
         return Clock(None, None, (), False, tuple(counters))
-    _, place, stamps, elapsed = max(found)
+    *_, place, stamps, elapsed = max(found)
     return Clock(-place, None, stamps, elapsed, (*counters, *(i for i in ticking if i != -place)))
 
 

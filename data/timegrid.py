@@ -12,7 +12,8 @@ Repair of the time column, in this order
 Grid: t = 0, step, 2·step, … from the first sample to the last. Where the grid is at least twice as coarse as the
 samples, a value is the mean of the samples within ± step/2; the first value takes only samples before the first
 source interval has passed, so that the zero is the true start. Where it is finer, values are interpolated linearly.
-Drivers are commanded and hold the last value. Inside a hole longer than `max_gap_s` there is nothing (NaN), and none
+Drivers are commanded and hold the last value. Inside a hole longer than `max_gap_s`, or than 2.5 usual intervals of a
+channel that has fewer samples than the rows, there is nothing (NaN), and none
 where the instrument stated that it had no value: a grid row with such a sample, and no other, within ± step/2 is empty.
 """
 
@@ -35,7 +36,9 @@ _ENDLESS_S = 1e13  # no clock shows this; keeps differences finite
 _EPS = 1e-6  # of a step: 60 s reached by minutes × 60
 _LEAST_ROWS = 12  # of a grid on which the checks find a step
 _SQUEEZED = 10.0  # samples in a grid row
-_FINEST = 2.0  # grid rows for a sample: every other one is interpolated
+_FINEST = 5.0  # grid rows for a sample: more are invented
+_LOST = 2.5  # usual intervals of a channel: one lost sample is no hole
+_SLOWEST_S = 600.0  # a channel that is read less often misses a warm-up: nothing is known between its samples
 _NEAR_STEP = 7.5  # times; units of time are 60 apart
 
 
@@ -112,16 +115,13 @@ def _carry_on(t: Array, step: Array, max_gap_s: float) -> tuple[Array, int]:
 
 
 def check_step(time_s: Array, step_s: float, unit: str, where: str, finer: bool) -> None:
-    """Refuse a grid that throws most samples of a short recording away, or that most rows of would be invented.
-
-    `finer` allows the latter, for sweeps.
+    """Refuse a grid that throws most samples of a short recording away, or, unless `finer`, invents most of its rows.
 
     Raises:
-        InputError: fewer than 12 grid rows, each of more than 10 samples, or a step of less than half of the samples'
-            interval; with the likely unit.
+        InputError: fewer than 12 grid rows, each of more than 10 samples, or more than 5 for a sample; the likely unit.
     """
     rows, interval = int(time_s[-1] / step_s + _EPS) + 1, _interval(time_s)
-    if step_s < interval / _FINEST and not finer:
+    if interval > _FINEST * step_s * (1 + _EPS) and not finer:
         raise InputError(
             f"{where}: rows are {interval:.4g} s apart but recording.step_s is {step_s:g} s: {rows} grid rows from"
             f" {len(time_s)}; {_other_unit(interval, step_s, unit)}, or raise step_s to {interval:.4g}"
@@ -196,7 +196,9 @@ def to_grid(
         if len(there) == 0:
             result[name] = np.full(len(grid), np.nan)
             continue
-        part = _Sampled(time_s[there], grid, step_s, max_gap_s, coarse, interval)
+        own_s = _interval(time_s[there])
+        gap_s = max(max_gap_s, _LOST * own_s) if own_s <= _SLOWEST_S else max_gap_s
+        part = _Sampled(time_s[there], grid, step_s, gap_s, coarse, interval)
         result[name] = part.held(v[there]) if name in held else part.continuous(v[there])
         channel_gaps += max(0, part.gaps - full_gaps)
         used[there[part.used]] = True

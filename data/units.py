@@ -81,14 +81,17 @@ _CANONICAL = {"temperature": "degC", "ambient": "degC", "error": "um"}
 _CASE_TELLS = ("mW", "MPa", "mohm", "VA")  # in other cases they are other units, or words
 
 
+def plain(text: str) -> str:
+    """A text with one form of each letter (NFKC), Latin letters without accents, µ as u."""
+    plain = unicodedata.normalize("NFKC", text)
+    if not plain.isascii():
+        plain = "".join(c for c in unicodedata.normalize("NFD", plain) if c == "\u3099" or not unicodedata.combining(c))
+        plain = unicodedata.normalize("NFC", plain)
+    return plain.replace("μ", "u").replace("ß", "ss")
+
+
 def _fold(text: str) -> str:
-    folded = unicodedata.normalize("NFKC", text).strip().strip("[]()").strip()
-    if not folded.isascii():
-        folded = "".join(
-            c for c in unicodedata.normalize("NFD", folded) if c == "\u3099" or not unicodedata.combining(c)
-        )
-        folded = unicodedata.normalize("NFC", folded)
-    folded = folded.replace("μ", "u").replace("\N{MINUS SIGN}", "-").casefold()
+    folded = plain(text).strip().strip("[]()").strip().replace("\N{MINUS SIGN}", "-").casefold()
     return re.sub(r"^(deg(ree)?s?\.?|grad|°) ?(?=[ckf])", "deg ", folded)
 
 

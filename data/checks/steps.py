@@ -18,8 +18,6 @@ from data.checks.base import (
     rolling_median,
     signals,
     step_limit,
-    thinned,
-    widened,
 )
 from data.checks.expected import Expected
 from data.machine import Machine
@@ -89,7 +87,7 @@ _BACK_S = 900.0
 class JumpNoReturn(Check):
     """A step beyond noise, resolution and the channel's own liveliness, not shared by others, which the drivers and the
     other channels do not explain (`Expected`). Masked from the first odd step to the batch's end, or to the step that
-    brings it back. A fast recording is checked row by row and over 10 s, where a step spread over seconds shows.
+    brings it back. What takes longer than a sampling interval is a slope: a machine that warms has those.
     """
 
     key = "jump_no_return"
@@ -105,13 +103,6 @@ class JumpNoReturn(Check):
         return "up" if len(before) and len(after) and np.median(after) > before[-1] else "down"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
-        found = self._at(batch)
-        if thin := thinned(batch):
-            reported = {f.channel for f in found}
-            found += [widened(f, batch, thin) for f in self._at(thin) if f.channel not in reported]
-        return found
-
-    def _at(self, batch: Batch) -> list[Finding]:
         seen = signals(batch)
         names = in_time(batch, *_LEAST)
         # a step less the median step around it is at most twice the largest step: the others cannot be odd

@@ -9,6 +9,7 @@ import pandas as pd
 
 from data.batch import Batch, Finding
 from data.checks.base import THERMAL, Check, clock, in_time, signals, span_text, step_limit, stretches, thinned, widened
+from data.guess import sustained_rate, unit_doubt
 from data.machine import Machine
 
 _REPAIRS = {
@@ -34,6 +35,13 @@ class Clock(Check):
             for kind, repair in _REPAIRS.items()
             if batch.repairs.get(kind)
         ]
+        unit = machine.recording.time.unit
+        if unit != "timestamp" and machine.recording.time.step is None and batch.n_rows > 1:
+            warm = [batch.values(n) for n in batch.names(*THERMAL) if n in batch.table.columns]
+            rate = max((sustained_rate(batch.time_s, v) for v in warm), default=0.0)
+            if doubt := unit_doubt(unit, batch.step_s, float(batch.time_s[-1]), rate):
+                message = f"clock: recording.time.unit: {doubt}; correct it, step_s and max_gap_s if so"
+                found.append(self.finding(None, message, masks=False))
         start = batch.start
         if start is not None and not _FIRST <= start <= pd.Timestamp.now() + _AHEAD:
             when = "before any logger of this kind" if start < _FIRST else "in the future"

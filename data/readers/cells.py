@@ -25,7 +25,7 @@ _TIMES = ("%H:%M:%S", "%H:%M:%S.%f", "%H:%M", "%H-%M-%S", "%I:%M:%S %p", "%I:%M:
 _BETWEEN = (" ", "T", "-", "_", ", ", ":")  # date and time of day
 _PATTERNS = [*(f"{d}{sep}{t}" for d in _DATES for t in _TIMES for sep in _BETWEEN), *_TIMES, *_DATES]
 _ISO = "ISO8601"
-_MISSING = ("", "nan", "NaN", "NAN")
+MISSING = ("", "nan", "NaN", "NAN")
 _ZONES_H = {
     zone: hours
     for hours, zones in {0: "Z UTC GMT WET", 1: "WEST BST CET MEZ", 2: "CEST MESZ EET", 3: "EEST MSK", 9: "JST KST",
@@ -105,7 +105,7 @@ def _text_to_float(column: Any, decimal: str, unit: str) -> tuple[Array, NDArray
         cells = pc.take(text, pa.array(rest)).to_pylist()
         read = {cell: _in_unit(cell, decimal, unit) for cell in set(cells)}
         values[rest] = [np.nan if read[c] is None else read[c] for c in cells]
-        bad[rest] = [read[c] is None and c not in _MISSING for c in cells]
+        bad[rest] = [read[c] is None and c not in MISSING for c in cells]
     return values, bad if bad.any() else None
 
 

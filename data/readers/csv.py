@@ -55,7 +55,8 @@ def find_encoding(raw: bytes, where: str) -> str:
         even, odd = raw[0::2].count(0), raw[1::2].count(0)
         if min(even, odd) * 10 < max(even, odd) and max(even, odd) * 4 > len(raw) // 2:
             return "utf-16-le" if odd > even else "utf-16-be"
-        raise _not_text(where)
+        line = raw.count(b"\n", 0, raw.index(b"\0")) + 1
+        raise _not_text(where, f": {raw.count(bytes(1))} NUL bytes from line {line} on, as a crash leaves them")
     control = sum(raw.count(bytes([c])) for c in (*range(1, 9), 11, *range(14, 26), 28, 29, 30, 31))
     if control * 100 > len(raw):
         raise _not_text(where)
@@ -68,8 +69,8 @@ def find_encoding(raw: bytes, where: str) -> str:
     return best.encoding if best is not None else "cp1252"
 
 
-def _not_text(where: str) -> InputError:
-    return InputError(f"{where}: not a text file (binary content); expected CSV text; export the recording again")
+def _not_text(where: str, what: str = "") -> InputError:
+    return InputError(f"{where}: not a text file (binary content){what}; expected CSV text; export the recording again")
 
 
 def _decodes(raw: bytes, encoding: str) -> bool:
@@ -163,7 +164,9 @@ class CsvSheet(Sheet):
         self.encoding = form.encoding or find_encoding(raw, path.name)
         text = raw.decode(self.encoding, "replace")
         lines = _ENDS.split(text)
-        lines = lines[:-1] if (more and len(lines) > 1) or not lines[-1] else lines
+        if more and len(lines) == 1:
+            raise InputError(f"{path.name}: its first line is longer than 1 MB; expected names; export it again")
+        lines = lines[:-1] if more or not lines[-1] else lines
         lines = _whole(lines)
         below = [*lines[1:], ""]
         lines = [_COMMENT.sub("", a) if _NUMERIC.match(b) else a for a, b in zip(lines, below, strict=True)]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from difflib import SequenceMatcher
 from typing import Any
 
 from data.errors import InputError
@@ -14,6 +14,7 @@ from data.readers.base import Sheet
 from data.readers.cells import parse_number, wall_clock_s
 from data.readers.csv import normalise
 
+_WORDS = re.compile(r"[^\W\d_]+|\d+")
 _UNIT_ROWS = 3  # rows between header and data that may hold units or descriptions
 
 
@@ -134,8 +135,8 @@ def locate(sheet: Sheet, machine: Machine, where: str, need_error: bool = True) 
     for name, column in wanted.items():
         if name not in got_channels and isinstance(column, str) and (meant := _misspelt(column, unknown)):
             raise InputError(
-                f"{where}: column {column!r} of channel {name!r} is missing; did you mean {str(header[by_name[meant]])!r}?"
-                " Correct column: of the channel, or add that one to ignore"
+                f"{where}: column {column!r} of channel {name!r} is missing; did you mean"
+                f" {str(header[by_name[meant]])!r}? Correct column: of the channel, or add that one to ignore"
             )
     named = sum(bool(str(c or "").strip()) for c in header) if header else width
     first = machine.recording.header_rows
@@ -164,25 +165,14 @@ def _is_row(row: Sequence[Any], decimal: str) -> bool:
 
 
 def _misspelt(column: str, others: Sequence[str]) -> str | None:
-    """The name whose words are those of a column with letters in another order, one more, one less or another one.
-
-    Numbers and words of up to four letters must be the same: they tell sensors and axes apart.
-    """
-    words = _words(column)
+    """The name that differs from a column's by some letters of long words: short ones and numbers name a sensor."""
+    words = _WORDS.findall(normalise(column))
     for other in others:
-        pairs = list(zip(words, theirs := _words(other), strict=False))
-        alike = all(a == b or (min(len(a), len(b)) > 4 and _close(a, b)) for a, b in pairs)
-        if "".join(words) == "".join(theirs) or (alike and len(words) == len(theirs)):
+        pairs = zip(words, theirs, strict=True) if len(theirs := _WORDS.findall(other)) == len(words) else ()
+        odd = [(a, SequenceMatcher(None, a, b).ratio()) for a, b in pairs if a != b]
+        if odd and all(a.isalpha() and len(a) > 4 and ratio >= 0.75 for a, ratio in odd):
             return other
     return None
-
-
-def _words(name: str) -> list[str]:
-    return re.findall(r"[^\W\d_]+|\d+", normalise(name))
-
-
-def _close(one: str, other: str) -> bool:
-    return one.isalpha() and difflib.SequenceMatcher(None, one, other).ratio() >= 0.75
 
 
 def _some(names: Sequence[str], n: int = 3) -> str:

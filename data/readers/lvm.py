@@ -29,7 +29,8 @@ class LvmSheet(CsvSheet):
         self.summary = f"LabVIEW measurement, decimal {self.decimal}, {self.encoding}"
         columns = first.get("X_Columns", "One")
         labels = keys.get("Y_Unit_Label") or [""] * len(self.head[min(end + 1, len(self.head) - 1)])
-        self.units = [u for label in labels for u in ("s", label)] if columns == "Multi" else ["s", *labels]
+        of_time = "s" if end >= 0 else ""  # LabVIEW's header states no other unit of time
+        self.units = [u for label in labels for u in (of_time, label)] if columns == "Multi" else [of_time, *labels]
         if columns == "No":
             self.step_s = parse_number(first.get("Delta_X"), self.decimal)
         begins = parse_number((self.head[end + 2 : end + 3] or [[""]])[0][0], self.decimal) or 0.0

@@ -15,7 +15,7 @@ from data.readers.cells import stamp_formats, to_float, to_seconds
 from data.readers.csv import normalise
 
 _LOOK_ROWS = 200
-_MOST_NAMES = 2000
+MOST_NAMES = 2000
 _SCAN_SHARE = 0.05  # of the time between two readings of a name: between two names in a scan
 
 
@@ -51,7 +51,7 @@ class PivotSheet(Sheet):
         self._ragged += int(np.isnan(seconds).sum())
         frame = frame.assign(order=seconds)[~np.isnan(seconds)].sort_values("order", kind="stable")
         label = frame["name"] if len(values) == 1 else frame["name"] + " " + frame["value"].map(dict(enumerate(values)))
-        if label.nunique() > _MOST_NAMES:
+        if label.nunique() > MOST_NAMES:
             raise InputError(f"{where}: {label.nunique()} different names in {names}; correct recording.pivot.name")
         frame = frame.assign(label=label, order=_scans(frame["order"], label))
         frame = frame.assign(again=frame.groupby(["order", "label"], sort=False).cumcount())

@@ -54,13 +54,22 @@ def test_a_clean_recording_is_clean_at_every_rate(step_s: float, noise_K: float)
     assert [f.message for f in findings(recorded(step_s, noise_K))] == []
 
 
-@pytest.mark.parametrize("step_s", RATES_S)
-@pytest.mark.parametrize("spread_s", [0.0, 4.0])
+@pytest.mark.parametrize(("step_s", "spread_s"), [(0.1, 0.0), (1.0, 0.0), (60.0, 0.0), (60.0, 4.0)])
 @pytest.mark.parametrize(("name", "size"), [("bed", 6.0), ("x", 60.0)])
-def test_a_jump_is_found_though_the_logger_smooths_it(name: str, size: float, spread_s: float, step_s: float) -> None:
+def test_a_jump_within_a_sampling_interval_is_found(name: str, size: float, spread_s: float, step_s: float) -> None:
     found = findings(stepped(recorded(step_s), {name: size}, spread_s))
     assert [(f.check, f.channel, f.end_s) for f in found] == [("jump_no_return", name, None)]
     assert FAULT_S - max(step_s, 10.0) <= (found[0].start_s or 0.0) <= FAULT_S + max(step_s, 0.5)
+
+
+@pytest.mark.parametrize("minute", [0.0, 30.0])
+def test_a_steep_warm_up_is_no_jump(minute: float) -> None:
+    """98 µm in one minute and never more than 6.3 µm in 2 s: a slope of many rows."""
+    batch = recorded(2.0)
+    since_s = np.maximum(batch.time_s - 60.0 * minute, 0.0)
+    z = np.round(130.0 * (1.0 - np.exp(-since_s / 42.0)), 1)
+    assert 97.0 < z[round(30 * minute) + 30] < 99.5 and np.abs(np.diff(z)).max() < 6.3
+    assert [f for f in findings(replace(batch, table=batch.table.assign(z=z))) if f.masks] == []
 
 
 @pytest.mark.parametrize("spread_s", [0.0, 5.0])

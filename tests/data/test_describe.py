@@ -217,7 +217,7 @@ def test_without_a_clock_the_draft_asks_for_the_step(tmp_path, counter):
     with pytest.raises(InputError, match=r"line \d+: key 'recording.time': .*the time between two rows"):
         parse_machine(text, "draft")
     machine = parse_machine(text.replace("? s", "1 min"), "draft")
-    assert {"T9", "Spindle_temp", "dz_um"} == {*machine.channels}
+    assert {"T9", "Spindle_temp", "dz"} == {*machine.channels}
     assert machine.ignore == ([] if counter is None else [counter])
     (batch,) = read_batches(tmp_path / "a.csv", machine)
     assert batch.time_s.tolist() == [60.0 * i for i in range(300)]
@@ -301,7 +301,7 @@ def test_codes_for_no_value_are_no_readings(tmp_path):
         "column 'Spindle temp': -999 (5×) is taken for a missing value",
         "column 'dz [um]': 3.4e+38 (1×) is taken for a missing value",
     ]
-    warm, error = machine.channels["Spindle_temp"], machine.channels["dz_um"]
+    warm, error = machine.channels["Spindle_temp"], machine.channels["dz"]
     assert warm.resolution == 0.01 and warm.range[0] >= -50 and error.range[1] < 1000
     assert guess.seen_range(np.append(np.linspace(20, 30, 50), 1e12)) == (20.0, 30.0)
 
@@ -350,10 +350,10 @@ def test_rows_that_share_a_stamp_are_a_sweep(tmp_path: Path) -> None:
         "T nut": nut(t),
     }
     text, machine, _ = draft_of(tmp_path, pd.DataFrame(table))
-    assert "position: P_mm  # guessed: rows share a time stamp while the position changes" in text
+    assert "position: P  # guessed: rows share a time stamp while the position changes" in text
     assert "guessed: [role, unit, position, range]" in text
     assert (machine.recording.step_s, machine.recording.max_gap_s) == (10, 9000)  # 12 rows in two minutes
-    at, error = sweeps_of(tmp_path / "a.csv", machine, "deviation_um")
+    at, error = sweeps_of(tmp_path / "a.csv", machine, "deviation")
     assert np.allclose(at, AT_MM) and np.allclose(error, error_um(SWEEPS_MIN))
 
 
@@ -408,5 +408,5 @@ def test_an_axis_that_moves_beside_a_steady_record_is_no_sweep(tmp_path: Path) -
     t = np.arange(0, 240.0)
     table = {"time [min]": t, "P [mm]": np.resize(AT_MM, 240), "dz [um]": 10 * (1 - np.exp(-t / 60)), "T nut": nut(t)}
     _, machine, _ = draft_of(tmp_path, pd.DataFrame(table))
-    assert machine.channels["P_mm"].role == "position" and machine.channels["dz_um"].position is None
+    assert machine.channels["P"].role == "position" and machine.channels["dz"].position is None
     assert machine.recording.step_s == 60

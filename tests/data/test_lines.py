@@ -82,10 +82,10 @@ def test_rows_above_the_header_are_counted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [(("T_front:", "front: {column: T_fornt, "), r"run.csv: column 'T_fornt' of channel 'front' is missing; did you mean "
-      r"'T_front'\? Correct column: of the channel, or add that one to ignore"),
-     (("recording: {", "recording: {step_s: 6, "), r"run.csv: rows are 60 s apart but recording.step_s is 6 s: 1191 grid "
-      r"rows from 120; .*raise step_s to 60")],
+    [(("T_front:", "front: {column: T_fornt, "), "run.csv: column 'T_fornt' of channel 'front' is missing; did you "
+      r"mean 'T_front'\? Correct column: of the channel, or add that one to ignore"),
+     (("recording: {", "recording: {step_s: 6, "), "run.csv: rows are 60 s apart but recording.step_s is 6 s: 1191 "
+      "grid rows from 120; .*raise step_s to 60")],
 )  # fmt: skip
 def test_a_machine_file_that_does_not_fit_its_recording_is_refused(
     tmp_path: Path, change: tuple[str, str], message: str

@@ -209,7 +209,7 @@ def test_every_column_is_shown_with_what_becomes_of_it(tmp_path: Path) -> None:
     _, shown = drafted([path])
     assert [(c.column, c.becomes) for c in shown["a.csv"]] == [
         ("No", "left out: numbers the rows, or is another clock"), ("Time", "clock: its cells look like it"),
-        ("front [°F]", "temperature front_f, degF → degC"), ("z_um", "error z_um, um"),
+        ("front [°F]", "temperature front, degF → degC"), ("z_um", "error z_um, um"),
         ("note", "left out: text, such as 'ok'"),
     ]  # fmt: skip
     assert shown["a.csv"][2].numbers == pytest.approx(FRONT[:3], abs=6e-3)
@@ -290,3 +290,109 @@ def test_files_of_other_columns_are_not_in_the_pattern(tmp_path: Path) -> None:
 def test_a_split_needs_exactly_one_way() -> None:
     with pytest.raises(InputError, match="expected exactly one of driver, pause and every"):
         machine("split: {pause: 1 h, every: 1 d}")
+
+
+def test_a_log_of_a_3d_printer(tmp_path: Path) -> None:
+    """Its counter is no channel, though rows of it come twice, and the displacement is proposed as the error."""
+    table = [f"{i - i // 50},{0.098 * (1 - np.exp(-i / 60)):.4f},{210 - 185 * np.exp(-i / 9):.2f},{f}"
+             for i, f in enumerate(FRONT)]  # fmt: skip
+    path = saved(tmp_path, "klipper.csv", ["sample,mcu_pos_z,he_t,bed_t", *table])
+    text, shown = drafted([path])
+    machine = parse_machine(text.replace("? s", "2 s"), "draft")
+    assert {n: c.role for n, c in machine.channels.items()} == {
+        "mcu_pos_z": "error", "he_t": "temperature", "bed_t": "temperature",
+    }  # fmt: skip
+    assert shown["klipper.csv"][0].becomes == "left out: numbers the rows, or is another clock"
+    assert "mcu_pos_z (no unit) is taken for the measured error; else set its role" in notes(text)
+
+
+@pytest.mark.parametrize("micro", ["\N{MICRO SIGN}", "\N{GREEK SMALL LETTER MU}"])
+def test_names_of_channels_can_be_typed(tmp_path: Path, micro: str) -> None:
+    """Without the unit in brackets and accents, in the header's case; the column is found by either µ."""
+    path = saved(tmp_path, "a.csv", [f"Zeit;Temp1_äC;Verlagerung_z [{micro}m]", *rows("{t:%d.%m.%Y %H:%M};{f};{z}")])
+    text = drafted([path])[0]
+    machine = parse_machine(text, "draft")
+    assert [(n, c.role, c.unit) for n, c in machine.channels.items()] == [
+        ("Temp1_aC", "temperature", "degC"), ("Verlagerung_z", "error", "um"),
+    ]  # fmt: skip
+    for other in ("\N{MICRO SIGN}", "\N{GREEK SMALL LETTER MU}"):
+        assert np.array_equal(read(path, text.replace(micro, other)).values("Verlagerung_z"), Z)
+
+
+def test_fractions_of_the_clock_and_alarms_are_no_channels(tmp_path: Path) -> None:
+    head = "Time,us,ms,Alarm 101,min,T1,z_um"
+    path = saved(tmp_path, "a.csv", [head, *rows("{t:%Y-%m-%d %H:%M},{F},{b},0,{f},{f},{z}")])
+    text, shown = drafted([path])
+    assert parse_machine(text, "draft").ignore == ["us", "ms", "Alarm 101"]
+    assert [c.becomes for c in shown["a.csv"][1:4]] == 2 * ["left out: a part of the clock"] + ["left out: an alarm"]
+    assert list(parse_machine(text, "draft").channels) == ["min", "T1", "z_um"]
+
+
+@pytest.mark.parametrize("name", ["Time", "clock"])
+@pytest.mark.parametrize("ticks", ["ticks", "Tick [ms]"])
+def test_a_clock_that_jumps_back_by_an_hour_stays_the_clock(tmp_path: Path, name: str, ticks: str) -> None:
+    jumped = [START + pd.Timedelta(minutes=3 * i - 60 * (i >= N // 2)) for i in range(N)]
+    table = [
+        f"{t:%Y-%m-%d %H:%M:%S},{180000 * i},{f},{z}" for i, (t, f, z) in enumerate(zip(jumped, FRONT, Z, strict=True))
+    ]
+    path = saved(tmp_path, "a.csv", [f"{name},{ticks},T1,z_um", *table])
+    text = drafted([path])[0]
+    assert parse_machine(text, "draft").recording.time.column == name
+    assert notes(text)[0].startswith("the clock jumps back by an hour at 2026-01-14 ")
+    batch = read(path, text)
+    assert np.array_equal(batch.values("z_um"), Z) and batch.repairs["clock_restarts"] == 1
+    assert (batch.start, batch.time_s[-1]) == (START, 180 * (N - 1))
+
+
+def test_the_step_of_recordings_without_a_clock_is_asked_once(tmp_path: Path) -> None:
+    """It is that of the joined file and of the grid."""
+    for name, table in (("t.xlsx", {"T1": FRONT, "T2": BED}), ("z.xlsx", {"z_um": Z})):
+        pd.DataFrame(table).to_excel(tmp_path / name, index=False)
+    text = drafted([tmp_path / "t.xlsx", tmp_path / "z.xlsx"])[0]
+    assert text.count("fill in") == 1 == text.count("step:") and "step_s" not in text
+    batch = read(tmp_path / "t.xlsx", text.replace("? s", "20 s"))
+    assert batch.step_s == 20 and np.array_equal(batch.values("z_um"), Z) and np.array_equal(batch.values("T1"), FRONT)
+
+
+def test_a_slow_channel_among_fast_rows_has_no_holes(tmp_path: Path) -> None:
+    """Temperatures every 20 s in rows of their own between rows of z every 2 s."""
+    fast = [(2.0 * i, f"{2 * i},,{i / 10}") for i in range(10 * N)]
+    slow = [(20.0 * i + 0.7, f"{20 * i + 0.7},{f},") for i, f in enumerate(FRONT)]
+    path = saved(tmp_path, "a.csv", ["time_s,T1,z_um", *(line for _, line in sorted(fast + slow))])
+    text = drafted([path])[0]
+    batch = read(path, text)
+    assert batch.repairs["rows_dropped"] == 0 == batch.repairs["channel_gaps"]
+    t = batch.time_s[1:-10]
+    assert np.abs(batch.values("T1")[1:-10] - np.interp(t, 20.0 * np.arange(N) + 0.7, FRONT)).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("body", "cause"),
+    [(b"", "holds no row below its first line"), (b"0,20,1\n", "holds one row of numbers"),
+     (b"0,NaN,NaN\n60,NaN,NaN\n120,NaN,NaN\n", r"no column of numbers next to the clock: T1 \(empty or NaN\), z_um "),
+     (b"0,20,1\n60,21,2\n120,22,3\n\0\0\0", r"not a text file \(binary content\): 3 NUL bytes from line 5")],
+)  # fmt: skip
+def test_each_unusable_file_has_its_cause(tmp_path: Path, body: bytes, cause: str) -> None:
+    path = tmp_path / "a.csv"
+    path.write_bytes(b"time_s,T1,z_um\n" + body)
+    with pytest.raises(InputError, match=rf"\Aa.csv: .*{cause}.*\Z"):
+        drafted([path])
+
+
+@pytest.mark.parametrize(
+    ("text", "cause"),
+    [("\n \n\n", "the table holds nothing, it is blank"),
+     ("time_s," + "x" * (1 << 20), "first line is longer than 1 MB"),
+     ("\n".join(",".join(["n", "T"][i < 1] + str(i + k) for k in range(5000)).replace("n", "") for i in range(9)),
+      "5000 columns of numbers; expected 1 to 2000")],
+)  # fmt: skip
+def test_each_strange_file_has_its_cause(tmp_path: Path, text: str, cause: str) -> None:
+    path = saved(tmp_path, "a.csv", text.split("\n"))
+    with pytest.raises(InputError, match=rf"\Aa.csv: .*{cause}"):
+        drafted([path])
+
+
+def test_text_named_lvm_without_labviews_header_states_no_unit_of_time(tmp_path: Path) -> None:
+    path = saved(tmp_path, "a.lvm", [f"{i}\t{f}\t{z}" for i, (f, z) in enumerate(zip(FRONT, Z, strict=True))])
+    text = drafted([path])[0]
+    assert "named so" not in text and any("no header gives the unit of time" in note for note in notes(text))

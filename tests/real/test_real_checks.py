@@ -80,8 +80,8 @@ def test_the_spindle_recording_is_clean() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="PT09 is masked in 5 of 32 runs and X in one; nothing names the time unit", strict=True)
-def test_minutes_read_as_seconds_mask_no_good_sensor_of_the_lathe() -> None:
+def test_minutes_read_as_seconds_are_named_and_mask_no_good_sensor_of_the_lathe() -> None:
+    """X is masked in a run where the recorder held it, and let it go within a row: a step at any rate."""
     if not LATHE.is_dir():
         pytest.skip("no ../shared/data/lathe_gv1203")
     given = load_machine(ROOT / "machines" / "lathe_gv1203.yml")
@@ -90,7 +90,7 @@ def test_minutes_read_as_seconds_mask_no_good_sensor_of_the_lathe() -> None:
     machine = given.model_copy(update={"recording": recording})
     found = [checked(b, machine) for f in sorted(LATHE.glob("20*.csv")) for b in read_batches(f, machine)]
     batches = check_machine(found, machine)
-    masked = {f.channel for b in batches for f in b.findings if f.masks and f.check == "jump_no_return"}
-    noted = [f for b in batches for f in b.findings if not f.masks and f.check == "jump_no_return"]
-    assert masked == {"PT10"} and len(noted) > 50
-    assert all("probably the time unit (recording.time.unit: s)" in f.message for f in noted)
+    masked = {(b.batch_id, f.channel) for b in batches for f in b.findings if f.masks and f.check == "jump_no_return"}
+    assert masked == {("20200821", "PT10"), ("20200723", "disp_x")} and "20200723" in HELD_AT_THE_STOP
+    named = [[f.message for f in b.findings if f.check == "clock"] for b in batches]
+    assert all("recording.time.unit: s gives" in m and "min would not" in m for (m,) in named) and len(named) == 32
