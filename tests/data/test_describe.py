@@ -82,7 +82,7 @@ def test_draft_reads_the_files_it_was_drafted_from(tmp_path, suffix):
         table = run(k)
         assert batch.start == pd.Timestamp(path.stem)
         assert np.allclose(batch.values("Disp_Z"), table["Disp. Z"], atol=1e-6)
-        assert np.allclose(batch.values("Oil_K"), table["Oil [K]"] - 273.15, atol=1e-6)
+        assert np.allclose(batch.values("Oil"), table["Oil [K]"] - 273.15, atol=1e-6)
         assert batch.repairs["rows_dropped"] == 0 == batch.repairs.get("unknown_columns", 0)
 
 
@@ -130,7 +130,7 @@ def test_timestamps_and_names_in_other_scripts(tmp_path):
     path.write_bytes(("时间,主轴温度,位移X\n" + "\n".join(lines) + "\n").encode("gb18030"))
     _, machine = draft([path])
     assert machine.recording.time.format == "%d.%m.%Y %H:%M:%S"
-    assert {n: c.role for n, c in machine.channels.items()} == {"主轴温度": "temperature", "位移x": "error"}
+    assert {n: c.role for n, c in machine.channels.items()} == {"主轴温度": "temperature", "位移X": "error"}
     (batch,) = read_batches(path, machine)
     assert batch.start == pd.Timestamp("2024-05-16 07:00")
     assert batch.n_rows == 40
