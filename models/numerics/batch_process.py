@@ -12,14 +12,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, lapack, solve_triangular
 
-from data.arrays import Array, Mask
+from data.arrays import Array
 from features.design import Design
 
 _WINDOW_S = 600.0
@@ -36,6 +36,7 @@ class Windows:
     y_um: Array
     time_h: Array
     batch: NDArray[np.int64]
+    _all: Windows | None = field(default=None, repr=False)  # those of more batches, that these are some of
 
     @classmethod
     def of(cls, design: Design, x: Array, train: Sequence[int]) -> Windows:
@@ -62,7 +63,7 @@ class Windows:
 
     def only(self, batches: Sequence[int]) -> Windows:
         keep = np.isin(self.batch, list(batches))
-        return Windows(self.x[keep], self.y_um[keep], self.time_h[keep], self.batch[keep])
+        return Windows(self.x[keep], self.y_um[keep], self.time_h[keep], self.batch[keep], self)
 
     @cached_property
     def ids(self) -> NDArray[np.int64]:
@@ -91,19 +92,41 @@ class Windows:
     def _whitened(self) -> dict[float, tuple[Array, Array]]:
         return {}
 
+    @cached_property
+    def _pooled(self) -> dict[tuple[float, bytes, bytes], Pooled]:
+        return {}
+
     def whitened_sums(self, steady: float) -> tuple[Array, Array]:
         """xᵀ D⁻¹ x (B, m, m) and xᵀ D⁻¹ y (B, m) of every batch, D its own block of `drift`."""
         if steady not in self._whitened:
-            m = self.x.shape[1]
-            xx, xy = np.empty((len(self.ids), m, m)), np.empty((len(self.ids), m))
-            for i, (a, n) in enumerate(zip(self.borders, self.counts, strict=False)):
-                rows = slice(a, a + n)
-                own = Windows(self.x[rows], self.y_um[rows], self.time_h[rows], self.batch[rows])
-                factor = np.linalg.cholesky(own.drift(steady))
-                table = solve_triangular(factor, np.column_stack([own.x, own.y_um]), lower=True)
-                xx[i], xy[i] = table[:, :m].T @ table[:, :m], table[:, :m].T @ table[:, m]
+            if self._all is not None:
+                some = np.isin(self._all.ids, self.ids)
+                xx, xy = (sums[some] for sums in self._all.whitened_sums(steady))
+            else:
+                xx, xy = self._summed(steady)
             self._whitened[steady] = xx, xy
         return self._whitened[steady]
+
+    def _summed(self, steady: float) -> tuple[Array, Array]:
+        m = self.x.shape[1]
+        xx, xy = np.empty((len(self.ids), m, m)), np.empty((len(self.ids), m))
+        for i, (a, n) in enumerate(zip(self.borders, self.counts, strict=False)):
+            rows = slice(a, a + n)
+            own = Windows(self.x[rows], self.y_um[rows], self.time_h[rows], self.batch[rows])
+            factor = np.linalg.cholesky(own.drift(steady))
+            table = solve_triangular(factor, np.column_stack([own.x, own.y_um]), lower=True)
+            xx[i], xy[i] = table[:, :m].T @ table[:, :m], table[:, :m].T @ table[:, m]
+        return xx, xy
+
+    def pooled(self, steady: float, active: NDArray[np.int64], wide: Array) -> Pooled:
+        """The whitened sums of some columns, those of a batch over its drift variance `wide` (B,)."""
+        key = steady, active.tobytes(), wide.tobytes()
+        if key not in self._pooled:
+            xx, xy = self.whitened_sums(steady)
+            if len(active) < xx.shape[1]:
+                xx, xy = xx[:, active[:, None], active], xy[:, active]
+            self._pooled[key] = Pooled(xx / wide[:, None, None], xy / wide[:, None])
+        return self._pooled[key]
 
     def drift(self, steady: float) -> Array:
         """Covariance (N, N) of what no column explains, block by block, in units of a random walk's after an hour.
@@ -113,6 +136,67 @@ class Windows:
         same = self.batch[:, None] == self.batch[None, :]
         walk = np.minimum(self.time_h[:, None], self.time_h[None, :])
         return np.where(same, walk + steady, 0.0) + steady * np.eye(len(self.y_um))
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """xᵀx (B, a, a) and xᵀy (B, a) of every batch, and their sums over sets of batches.
+
+    A sum is of what comes before a batch and what comes after it: subtracting a batch would cancel digits.
+    """
+
+    xx: Array
+    xy: Array
+
+    @cached_property
+    def whole(self) -> tuple[Array, Array]:
+        """Over all batches, (1, …) each."""
+        return self.xx.sum(axis=0)[None], self.xy.sum(axis=0)[None]
+
+    @cached_property
+    def _last(self) -> dict[int | None, tuple[Array, Array]]:
+        return {}
+
+    def without(self, k: int | None = None) -> tuple[Array, Array]:
+        """Over all but one in turn, (B, …) each, k missing from all; place k is without k alone.
+
+        Kept for the next call with the same k: settings of the prior share them.
+        """
+        if k not in self._last:
+            self._last.clear()
+            self._last[k] = _all_but_one(self.xx, k), _all_but_one(self.xy, k)
+        return self._last[k]
+
+
+def _all_but_one(each: Array, k: int | None) -> Array:
+    """Sums over the first axis without each place in turn, and without k."""
+    own = each
+    if k is not None:
+        own = each.copy()
+        own[k] = 0.0
+    out = np.zeros_like(own)
+    for i in range(1, len(own)):
+        np.add(out[i - 1], own[i - 1], out=out[i])
+    after = np.zeros_like(own[0])
+    for i in range(len(own) - 2, -1, -1):
+        after += own[i + 1]
+        out[i] += after
+    return out
+
+
+def _ridge(xx: Array, xy: Array, precision: Array) -> Array:
+    """Solutions (S, a) of (xx + diag(precision)) β = xy; Cholesky's error does not depend on the columns' units."""
+    out, step = np.empty_like(xy), len(precision) + 1
+    for i, (matrix, right) in enumerate(zip(xx, xy, strict=True)):
+        own = matrix.copy()
+        own.flat[::step] += precision
+        _, solved, info = lapack.dposv(own.T, right, lower=1, overwrite_a=1)
+        if info != 0:  # beyond rounding; elimination with pivots still gives a finite answer
+            own = matrix.copy()
+            own.flat[::step] += precision
+            solved = np.linalg.solve(own, right)
+        out[i] = np.ravel(solved)
+    return out
 
 
 class BatchProcess(ABC):
@@ -150,8 +234,8 @@ class BatchProcess(ABC):
 class ByColumns(BatchProcess):
     """Posterior of the gains from sums over the batches that are left in.
 
-    With the rows of a batch whitened by its drift, and columns over their prior spread, the gains of a set of batches
-    are (I + Σ xᵀx)⁻¹ Σ xᵀy. The sums are added up anew for every set: subtracting a batch would cancel digits.
+    With the rows of a batch whitened by its drift, the gains of a set of batches are (V⁻¹ + Σ xᵀx)⁻¹ Σ xᵀy, V the prior
+    variances. Processes of the same windows share the sums, see `Pooled`.
     """
 
     windows: Windows
@@ -161,14 +245,19 @@ class ByColumns(BatchProcess):
 
     def gains(self, without: int | None = None) -> Array:
         out = np.zeros(len(self.variance))
-        everything = np.ones((1, len(self.wide)), bool)
-        out[self._active] = self._solved(everything)[0] if without is None else self._gains_without[without]
+        if without is None:
+            out[self._active] = self._solved(*self._pooled.whole)[0]
+            return out
+        if without not in self._gains:
+            xx, xy = self._pooled.without(without)
+            self._gains[without] = self._solved(xx[without : without + 1], xy[without : without + 1])[0]
+        out[self._active] = self._gains[without]
         return out
 
     def left_um(self, without: int | None = None) -> Array:
         if without is None:
             x, y_um = self._padded
-            return y_um - (x @ self._gains_without[:, :, None])[:, :, 0]
+            return y_um - (x @ self._solved(*self._pooled.without())[:, :, None])[:, :, 0]
         self._leave_out(without)
         return self._pairs_um[without]
 
@@ -179,28 +268,19 @@ class ByColumns(BatchProcess):
     @cached_property
     def _padded(self) -> tuple[Array, Array]:
         x, y_um = self.windows.padded
-        return x[:, :, self._active], y_um
+        return (x if len(self._active) == x.shape[2] else x[:, :, self._active]), y_um
+
+    @property
+    def _pooled(self) -> Pooled:
+        return self.windows.pooled(self.steady, self._active, self.wide)
+
+    def _solved(self, xx: Array, xy: Array) -> Array:
+        """Gains (S, a) from the sums over S sets of batches."""
+        return _ridge(xx, xy, 1.0 / self.variance[self._active])
 
     @cached_property
-    def _sums(self) -> tuple[Array, Array]:
-        """xᵀx (B, a²) and xᵀy (B, a) of every batch."""
-        xx, xy = self.windows.whitened_sums(self.steady)
-        spread = np.sqrt(self.variance[self._active])
-        scale = (spread[:, None] * spread) / self.wide[:, None, None]
-        xx = xx[:, self._active[:, None], self._active] * scale
-        return xx.reshape(len(xx), -1), xy[:, self._active] * (spread / self.wide[:, None])
-
-    def _solved(self, masks: Mask) -> Array:
-        """Gains (S, a) from the batches of each set, masks (S, B)."""
-        (xx, xy), take, a = self._sums, masks.astype(float), len(self._active)
-        matrix = (take @ xx).reshape(-1, a, a)
-        matrix[:, range(a), range(a)] += 1.0
-        solved = np.linalg.solve(matrix, (take @ xy)[:, :, None])[:, :, 0]
-        return np.asarray(solved * np.sqrt(self.variance[self._active]))
-
-    @cached_property
-    def _gains_without(self) -> Array:
-        return self._solved(~np.eye(len(self.wide), dtype=bool))
+    def _gains(self) -> dict[int, Array]:
+        return {}
 
     @cached_property
     def _pairs_um(self) -> Array:
@@ -216,9 +296,8 @@ class ByColumns(BatchProcess):
             return
         others = np.array([i for i in range(len(self.wide)) if i != k and i not in self._left], np.int64)
         self._left.add(k)
-        masks = np.ones((len(others), len(self.wide)), bool)
-        masks[:, k] = masks[range(len(others)), others] = False
-        gains, (x, y_um) = self._solved(masks), self._padded
+        (xx, xy), (x, y_um) = self._pooled.without(k), self._padded
+        gains = self._solved(xx[others], xy[others])
         self._pairs_um[k, others] = y_um[others] - (x[others] @ gains[:, :, None])[:, :, 0]
         self._pairs_um[others, k] = y_um[k] - gains @ x[k].T
 
