@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from compensation.substitutes import Guard, Substitutes
+from compensation.substitutes import Guard, Substitutes, Watch
 from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError
@@ -18,7 +18,7 @@ from models.metrics import residual_std_um
 BEGINS = 4  # a fault begins after this part of a run
 LOOKS = 75  # of the guard in a run: every five minutes in one of six hours
 COUNTS_SHARE = 0.1  # of the largest correction; a fault of less is within what a model leaves anyway
-Predict = Callable[[Batch], Array]  # error (n,) of a batch, µm
+Predict = Callable[[Sequence[Batch]], list[Array]]  # error (n,) of every batch, µm
 
 
 def faults(batch: Batch, names: Sequence[str]) -> Iterator[tuple[str, set[str], dict[str, Array]]]:
@@ -40,11 +40,24 @@ def faults(batch: Batch, names: Sequence[str]) -> Iterator[tuple[str, set[str], 
             yield "exchanged", {name, other}, {name: batch.masked(other), other: v}
 
 
+class Look(NamedTuple):
+    """One look of the guard: its state after it, the sensors that it does not trust, what it adds to each value, and
+    whether it gives up."""
+
+    watch: Watch
+    untrusted: frozenset[str]
+    change_K: Array
+    gave_up: bool
+
+
 @dataclass(frozen=True)
 class Watched:
-    """A run as the guard saw it: by row the sensors that it does not trust, the batch with what it lets pass, and how
-    many rows pass until it gives up."""
+    """A run as the guard saw it: its looks, so many rows apart, at the `given` values (looks, channels); by row the
+    sensors that it does not trust, the batch with what it lets pass, and how many rows pass until it gives up. What
+    comes after that is not watched where a sensor was found before."""
 
+    looks: tuple[Look, ...]
+    given: Array
     untrusted: tuple[frozenset[str], ...]
     passed: Batch
     until: int
@@ -55,25 +68,37 @@ class Watched:
         return next((k for k, names in enumerate(self.untrusted) if names), None)
 
 
-def watched(guard: Guard, batch: Batch, names: Sequence[str], every: int = 1) -> Watched:
+def watched(guard: Guard, batch: Batch, names: Sequence[str], every: int = 1, like: Watched | None = None) -> Watched:
     """Lead a run through the guard, as at the machine.
 
     Args:
         every: rows from one look of the guard to the next; what it changes in one holds for the rows between.
+        like: the same run with other values: as long as they are the same the looks are too.
     """
-    watch, found, changed, until = guard.begin(), list[frozenset[str]](), list[list[float]](), batch.n_rows
-    columns = {n: batch.masked(n) for n in names}
-    for k in range(0, batch.n_rows, every):
-        given = {n: float(columns[n][k]) for n in names}
-        watch, checked = guard.step(watch, float(batch.time_s[k]), given)
+    columns = np.column_stack([batch.masked(n) for n in names])
+    at = range(0, batch.n_rows, every)
+    given = columns[at]
+    looks = list[Look]() if like is None else list(like.looks[: _alike(given, like.given)])
+    watch = looks[-1].watch if looks else guard.begin()
+    for k in range(len(looks), len(at)):
+        if any(look.gave_up for look in looks[-1:]) and any(look.untrusted for look in looks):
+            break
+        values = dict(zip(names, given[k].tolist(), strict=True))
+        watch, checked = guard.step(watch, float(batch.time_s[at[k]]), values)
         untrusted = frozenset(n for n, s in checked.status.items() if s not in ("ok", "lost"))
-        held = min(every, batch.n_rows - k)
-        found += [untrusted] * held
-        changed += [[checked.values[n] - given[n] for n in names]] * held
-        if checked.fault is not None:
-            until = min(until, k)
-    table = {n: columns[n] + change for n, change in zip(names, np.array(changed).T, strict=True)}
-    return Watched(tuple(found), with_values(batch, table), until)
+        change_K = np.array([checked.values[n] for n in names]) - given[k]
+        looks.append(Look(watch, untrusted, change_K, checked.fault is not None))
+    of_row = np.minimum(np.arange(batch.n_rows) // every, len(looks) - 1)
+    until = next((at[k] for k, look in enumerate(looks) if look.gave_up), batch.n_rows)
+    passed = columns + np.array([look.change_K for look in looks])[of_row]
+    table = dict(zip(names, passed.T, strict=True))
+    return Watched(tuple(looks), given, tuple(looks[k].untrusted for k in of_row), with_values(batch, table), until)
+
+
+def _alike(given: Array, other: Array) -> int:
+    """How many rows are the same from the first on."""
+    differ = ~((given == other) | (np.isnan(given) & np.isnan(other))).all(axis=1)
+    return int(np.argmax(differ)) if differ.any() else len(given)
 
 
 def with_values(batch: Batch, columns: Mapping[str, Array]) -> Batch:
@@ -128,27 +153,32 @@ def fault_cost(predict: Predict, substitutes: Substitutes, batch: Batch, most_um
     if not names or batch.n_rows < BEGINS:
         return None
 
-    right_um, later = predict(batch), np.arange(batch.n_rows) >= batch.n_rows // BEGINS
+    later = np.arange(batch.n_rows) >= batch.n_rows // BEGINS
+    warmer = [with_values(batch, {n: batch.masked(n) + later}) for n in names]
+    every = [(kind, at_fault, with_values(batch, columns)) for kind, at_fault, columns in faults(batch, names)]
+    right_um, *given_um = predict([batch, *warmer, *(wrong for _, _, wrong in every)])
     sent_um = np.clip(right_um, -most_um, most_um)
 
-    def wrong_um(b: Batch, until: int) -> float:
-        return float(np.nanmax(np.abs(np.clip(predict(b), -most_um, most_um) - sent_um)[:until], initial=0.0))
+    def wrong_um(predicted_um: Array, until: int) -> float:
+        away_um = np.abs(np.clip(predicted_um, -most_um, most_um) - sent_um)
+        return float(np.nanmax(away_um[:until], initial=0.0))
 
-    um_per_K = {
-        n: float(np.nanmax(np.abs(predict(with_values(batch, {n: batch.masked(n) + later})) - right_um))) for n in names
-    }
-    guard, n, missed, worst, worst_um = Guard(substitutes), 0, 0, "", 0.0
-    every = max(1, batch.n_rows // LOOKS)
-    for kind, at_fault, columns in faults(batch, names):
-        wrong = with_values(batch, columns)
-        if wrong_um(wrong, batch.n_rows) <= COUNTS_SHARE * most_um:
-            continue
-        seen = watched(guard, wrong, list(substitutes.names), every)
-        cost_um = wrong_um(seen.passed, seen.until)
-        n, missed = n + 1, missed + (seen.first is None)
-        if cost_um > worst_um:
-            worst, worst_um = f"{' and '.join(sorted(at_fault))}: {kind}", cost_um
-    return FaultCost(um_per_K, n, missed, worst, worst_um)
+    um_per_K = {n: float(np.nanmax(np.abs(um - right_um))) for n, um in zip(names, given_um, strict=False)}
+    matter = [
+        fault
+        for fault, um in zip(every, given_um[len(names) :], strict=True)
+        if wrong_um(um, batch.n_rows) > COUNTS_SHARE * most_um
+    ]
+    guard, rows, guarded = Guard(substitutes), max(1, batch.n_rows // LOOKS), list(substitutes.names)
+    usual = watched(guard, batch, guarded, rows)
+    seen = [watched(guard, wrong, guarded, rows, usual) for _, _, wrong in matter]
+    passed_um = predict([own.passed for own in seen]) if seen else []
+    cost_um = [wrong_um(um, own.until) for um, own in zip(passed_um, seen, strict=True)]
+    worst, worst_um = "", 0.0
+    for (kind, at_fault, _), um in zip(matter, cost_um, strict=True):
+        if um > worst_um:
+            worst, worst_um = f"{' and '.join(sorted(at_fault))}: {kind}", um
+    return FaultCost(um_per_K, len(matter), sum(own.first is None for own in seen), worst, worst_um)
 
 
 _TRIED = 8  # runs, evenly spaced: the saving is far larger than its spread
@@ -172,12 +202,13 @@ def bridged(predict: Predict, target: str, batches: Sequence[Batch], names: Sequ
         learned = [Substitutes.learn(half, names) for half in halves]
     except InputError:  # too few runs in which all are recorded
         return ()
+    tried = np.unique(np.linspace(0, len(batches) - 1, _TRIED).round().astype(int))
+    without = [with_values(batches[k], {n: learned[1 - k % 2].without(n, batches[k])}) for k in tried for n in names]
+    left_um = iter(predict(without))
     saved_um: dict[str, list[float]] = {n: [] for n in names}
-    for k in np.unique(np.linspace(0, len(batches) - 1, _TRIED).round().astype(int)):
-        batch, other = batches[k], learned[1 - k % 2]
-        error_um = zeroed_error_um(batch, target)
+    for k in tried:
+        error_um = zeroed_error_um(batches[k], target)
         for n in names:
-            left_um = error_um - predict(with_values(batch, {n: other.without(n, batch)}))
-            saved = residual_std_um(error_um) - residual_std_um(left_um)
+            saved = residual_std_um(error_um) - residual_std_um(error_um - next(left_um))
             saved_um[n] += [saved] if np.isfinite(saved) else []
     return tuple(n for n, um in saved_um.items() if len(um) > 1 and np.mean(um) > np.std(um, ddof=1) / np.sqrt(len(um)))

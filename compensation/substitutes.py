@@ -21,14 +21,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import combinations
 from typing import Any, Literal, NamedTuple, Self, get_args
 
 import numpy as np
 
 from compensation.contracts import check_limits
-from data.arrays import Array, Mask
+from data.arrays import Array, Index, Mask
 from data.batch import Batch
 from data.checks.base import THERMAL, robust_sigma
 from data.errors import InputError, one_of
@@ -83,6 +83,12 @@ class GuardLimits:
         check_limits("limits of sensors", self)
 
 
+@cache
+def _sets(n: int, size: int) -> Index:
+    """All sets of `size` of n places, (S, size)."""
+    return np.array(list(combinations(range(n), size)), np.int64).reshape(-1, size)
+
+
 class Regression(NamedTuple):
     """Weights (n, n), row i for channel i; what is usual of its distance, K, (n,), enlarged as far as the Gaussian
     loses precision without the channels that are not good; and the Gaussian's standard deviation, K, (n,)."""
@@ -94,6 +100,20 @@ class Regression(NamedTuple):
     def worst(self, off_K: Array, far: Mask) -> int:
         """The channel whose fault alone explains most of the distances: of the largest standardised one."""
         return int(np.argmax(np.where(far, np.abs(off_K) / self.sd_K, 0.0)))
+
+    def misfits(self, good: Mask, rise_K: Array, size: int) -> Index:
+        """The `size` good channels without which the rises (n,) of the other good ones misfit least.
+
+        With P the precision of the good channels, the misfit r' P r falls by (P r)_S' P_SS⁻¹ (P r)_S without the set S
+        (block inverse), so that no set needs a regression of its own.
+        """
+        at = np.flatnonzero(good)
+        precision = (np.eye(len(at)) - self.weights[np.ix_(at, at)]) / self.sd_K[at, None] ** 2
+        sets = _sets(len(at), size)
+        pull = (precision @ rise_K[at])[sets]
+        own = precision[sets[:, :, None], sets[:, None, :]]
+        saved = np.einsum("si,si->s", pull, np.linalg.solve(own, pull[:, :, None])[:, :, 0])
+        return at[sets[np.argmax(saved)]]
 
 
 @dataclass(frozen=True)
@@ -275,7 +295,7 @@ class Watch:
     time_s: float | None = None
     levels: bool = True
 
-    @property
+    @cached_property
     def bad(self) -> Mask:
         return np.array([s != "ok" for s in self.status])
 
@@ -465,21 +485,19 @@ class Guard:
         assert s.level is not None
         rise_K = np.where(good, x - s.level, 0.0)
 
-        def judged(rest: Mask) -> tuple[float, bool, Regression]:
-            """Misfit of the rest, and whether it agrees."""
+        def judged(rest: Mask) -> tuple[bool, Regression]:
             regression = self._regression(s.levels, rest)
             left_K = np.where(rest, rise_K - regression.weights @ np.where(rest, rise_K, 0.0), 0.0)
-            misfit = float(np.sum(np.where(rest, rise_K * left_K / regression.sd_K**2, 0.0)))
-            return misfit, bool((np.abs(left_K) <= regression.usual_K + s.resolution_K).all()), regression
+            return bool((np.abs(left_K) <= regression.usual_K + s.resolution_K).all()), regression
 
-        _, agrees, regression = judged(good)
-        rest = good
+        rest, (agrees, regression) = good, judged(good)
+        every = regression
         for size in range(1, _MOST_OFF + 1):
             if agrees or good.sum() - size < _LEAST_PARITY - 1:
                 break
-            sets = (good & ~np.isin(np.arange(len(x)), out) for out in combinations(np.flatnonzero(good), size))
-            found = [(judged(rest), rest) for rest in sets]
-            (_, agrees, regression), rest = min(found, key=lambda f: f[0][0])
+            rest = good.copy()
+            rest[every.misfits(good, rise_K, size)] = False
+            agrees, regression = judged(rest)
         return rest & agrees, regression
 
     def _regression(self, of: Callable[[Mask], Regression], good: Mask) -> Regression:

@@ -23,6 +23,7 @@ from data.machine import Machine
 from features.design import Design
 from models.program import Builder, Program
 
+_AT_ONCE = 1_000_000  # inputs of rows that are predicted together; families have up to thirty columns of each
 Plain = dict[str, Any]  # str, int, float, list of those, or numpy array
 
 
@@ -156,7 +157,15 @@ class Family(ABC):
 
     def predict(self, batch: Batch) -> Array:
         """Error_um (n,) of a batch from its inputs alone, relative to its start as the training targets were."""
-        return self.predict_design(Design.build([batch], self.inputs, None), [0])[0]
+        return self.predict_batches([batch])[0]
+
+    def predict_batches(self, batches: Sequence[Batch]) -> list[Array]:
+        """The same of several batches, so many in one design as memory holds."""
+        found: list[Array] = []
+        for some in _by_size(batches, _AT_ONCE // max(1, len(self.inputs))):
+            design = Design.build(some, self.inputs, None)
+            found += self.predict_design(design, range(design.n_batches))
+        return found
 
     def program(self, channels: Mapping[str, Channel], step_s: float) -> Program:
         """The fitted model as operations with carried state, for rows `step_s` apart.
@@ -217,6 +226,18 @@ class Family(ABC):
         other = copy.copy(self)
         other.inputs, other.target, other.fitted = design.inputs, design.target, fitted
         return other
+
+
+def _by_size(batches: Sequence[Batch], most_rows: int) -> Iterator[list[Batch]]:
+    """The batches in their order, so many together as have at most so many rows; one at least."""
+    some: list[Batch] = []
+    for batch in batches:
+        if some and sum(b.n_rows for b in some) + batch.n_rows > most_rows:
+            yield some
+            some = []
+        some.append(batch)
+    if some:
+        yield some
 
 
 def family_from_plain(plain: Plain) -> Family:

@@ -37,6 +37,7 @@ def write(
     bound: RunBound | None = None,
     curves: pd.DataFrame | None = None,
     peers: pd.DataFrame | None = None,
+    substitutes: Substitutes | None = None,
 ) -> model_store.StoredModel:
     """Write the model folder of a family that was fitted on these batches, and read it back.
 
@@ -48,6 +49,7 @@ def write(
         curves: left-out predictions of the training, see `GridResult.curves`; without them the family is fitted again
             to learn what readings of a probe are worth.
         peers: other families, see `GridResult.stack`; without them nobody disagrees with the model.
+        substitutes: of the sensors; default: learned from the batches, see `guarded`.
 
     Raises:
         InputError: a family that is not fitted, or a machine file that cannot be used.
@@ -57,7 +59,8 @@ def write(
         "trained": _trained(family, batches),
         "largest_um": _largest_um(family, batches),
     }
-    updater, substitutes = _at_the_machine(family, machine_yaml, batches, curves)
+    updater = _updater(family, machine_yaml, batches, curves)
+    substitutes = substitutes or guarded(family, batches)
     model_store.save(
         folder, family, machine_yaml, region or Region.of(batches, family.inputs), dict(info or {}) | known, bound,
         _siblings(family, machine_yaml, batches, peers), updater, substitutes,
@@ -101,26 +104,30 @@ def _largest_um(family: Family, batches: Sequence[Batch]) -> float:
     return float(max((np.nanmax(e) for e in errors if np.isfinite(e).any()), default=0.0))
 
 
-def _at_the_machine(
+def _updater(
     family: Family, machine_yaml: str, batches: Sequence[Batch], curves: pd.DataFrame | None
-) -> tuple[Updater | None, Substitutes | None]:
-    """The filter of readings and the substitutes of sensors.
-
-    None where the batches are too few for them, or where the family does not run at a machine: some of those take
-    minutes to be fitted again.
-    """
-    updater, substitutes = None, None
+) -> Updater | None:
+    """The filter of readings; None where the batches are too few for it, or where the family does not run at a machine:
+    some of those take minutes to be fitted again."""
     if not batches or not family.has_program():
-        return None, None
+        return None
     ordered = _ordered(batches)
     with suppress(InputError):
         machine = parse_machine(machine_yaml, "machine.yml")
         design = Design.build(ordered, family.inputs, family.target, machine)
         tracks = left_out_tracks(design, curves) if curves is not None else []
-        updater = Updater.learn(tracks or out_of_fold(design, family.key, range(len(ordered))))
+        return Updater.learn(tracks or out_of_fold(design, family.key, range(len(ordered))))
+    return None
+
+
+def guarded(family: Family, batches: Sequence[Batch]) -> Substitutes | None:
+    """The substitutes of the sensors; None where the batches are too few, or where the family does not run at a
+    machine."""
+    if not batches or not family.has_program():
+        return None
     with suppress(InputError):
-        substitutes = substitutes_of(family, ordered)
-    return updater, substitutes
+        return substitutes_of(family, _ordered(batches))
+    return None
 
 
 def _ordered(batches: Sequence[Batch]) -> list[Batch]:
@@ -130,19 +137,15 @@ def _ordered(batches: Sequence[Batch]) -> list[Batch]:
 def substitutes_of(family: Family, ordered: Sequence[Batch]) -> Substitutes:
     """What replaces the sensors of a family while they fail, learned from batches in order of time."""
     learned = Substitutes.learn(ordered, list(dict.fromkeys(i.partition("@")[0] for i in family.inputs)))
-    return replace(learned, whole=bridged(family.predict, family.target, ordered, learned.names))
+    return replace(learned, whole=bridged(family.predict_batches, family.target, ordered, learned.names))
 
 
-def faults_of(family: Family, batches: Sequence[Batch]) -> FaultCost | None:
+def faults_of(family: Family, batches: Sequence[Batch], substitutes: Substitutes | None) -> FaultCost | None:
     """What failing sensors cost at the machine, from the run of the training with the largest error; None where the
-    family does not run at one, or its error moves no axis."""
+    family does not run at one, the runs are too few for a guard, or its error moves no axis."""
     largest = {b.batch_id: _largest_um(family, [b]) for b in batches}
     most_um = max(largest.values(), default=0.0)
-    if not most_um or not family.has_program() or batches[0].channels[family.target].unit != "um":
+    if substitutes is None or not most_um or batches[0].channels[family.target].unit != "um":
         return None
-    ordered = _ordered(batches)
-    run = max(ordered, key=lambda b: largest[b.batch_id])
-    try:
-        return fault_cost(family.predict, substitutes_of(family, ordered), run, ROOM * most_um)
-    except InputError:  # too few runs for a guard
-        return None
+    run = max(_ordered(batches), key=lambda b: largest[b.batch_id])
+    return fault_cost(family.predict_batches, substitutes, run, ROOM * most_um)

@@ -6,7 +6,7 @@ import hashlib
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -29,6 +29,7 @@ from mlflow.types import ColSpec, Schema
 from mlflow.types.schema import AnyType
 
 from compensation.faults import FaultCost
+from compensation.substitutes import Substitutes
 from data.batch import Batch
 from data.errors import InputError, closest, one_of
 from features.rises import zeroed_error_um
@@ -125,8 +126,12 @@ class Newcomer:
         return outlook(self.result, self.choice)
 
     @cached_property
+    def substitutes(self) -> Substitutes | None:
+        return fitted_model.guarded(self.family, self.batches)
+
+    @cached_property
     def faults(self) -> FaultCost | None:
-        return fitted_model.faults_of(self.family, self.batches)
+        return fitted_model.faults_of(self.family, self.batches, self.substitutes)
 
     @property
     def fingerprint(self) -> str:
@@ -565,8 +570,9 @@ def _log_version(client: MlflowClient, name: str, new: Newcomer, tags: dict[str,
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         stored = fitted_model.write(
-            folder, new.family, new.machine_yaml, new.batches, new.region, info, bound, result.curves, result.stack
-        )
+            folder, new.family, new.machine_yaml, new.batches, new.region, info, bound, result.curves, result.stack,
+            new.substitutes,
+        )  # fmt: skip
         served = write_served(stored, folder, stored.info["step_s"])
         code = Path(shutil.copy(Path(pyfunc_model.__file__).resolve(), folder / model_store.CODE))
         model_store.add_hashes(folder, [code.name])

@@ -387,7 +387,7 @@ def test_a_clock_that_was_set_back_is_named_and_orders_nothing_anew(store):
 
 def test_a_model_that_a_failed_sensor_can_ruin_is_no_champion_where_a_budget_says_so(store, monkeypatch):
     cost = FaultCost({"front": 9.0, "bed": 2.0}, 12, 3, "front: a drift of 1 K/h", 55.0)
-    monkeypatch.setattr(registry.fitted_model, "faults_of", lambda family, batches: cost)
+    monkeypatch.setattr(registry.fitted_model, "faults_of", lambda family, batches, substitutes: cost)
     within = replace(store, promotion=store.promotion.model_copy(update={"fault_budget_um": 60.0}))
     above = replace(store, promotion=store.promotion.model_copy(update={"fault_budget_um": 50.0}))
     refused = train(above, "toy-dear", [5.0, 6.0] * 3)
