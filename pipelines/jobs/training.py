@@ -8,7 +8,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import partial
@@ -170,6 +170,7 @@ def train(
         )
         outcome.diagnosis, outcome.diagnosis_summary = caller.map("diagnose", diagnose, [outcome.results])[0]
         clock("diagnose")
+    _remember(outcome, settings)
     return outcome
 
 
@@ -324,6 +325,14 @@ def _promote(
     region = Region.of(crossing.batches, family.inputs)
     new = registry.Newcomer(result, choice, family, text, outcome.training_ids[target], region, crossing.batches)
     outcome.promotions[target] = registry.promote(new, settings)
+
+
+def _remember(outcome: TrainOutcome, settings: Settings) -> None:
+    """Where the versions of the training and the champions are, for the commands after it."""
+    versions = {(p.name, v) for p in outcome.promotions.values() for v in (p.version, p.champion_version) if v}
+    if versions and not outcome.postponed:
+        with suppress(WorkError):  # the next command looks them up
+            registry.remember(sorted(versions), settings)
 
 
 def _report(outcome: TrainOutcome, settings: Settings, path: Path) -> Path:

@@ -68,11 +68,14 @@ def kept(settings: Settings) -> Registry:
     return Registry(made_from)
 
 
-def keep(known: Registry, aliases: Mapping[str, Mapping[str, str]], version: str, place: Place, home: Path) -> None:
-    """Add a version (NAME/VERSION) to what was `kept` before the registry was read."""
-    if known.made_from is None or not Path(place.folder).is_relative_to(known.made_from["artifacts"]):
+def keep(known: Registry, aliases: Mapping[str, Mapping[str, str]], found: Mapping[str, Place], home: Path) -> None:
+    """Add versions (NAME/VERSION) to what was `kept` before the registry was read."""
+    if known.made_from is None:
         return
-    places = {**known.places, version: place}
+    here = {v: p for v, p in found.items() if Path(p.folder).is_relative_to(known.made_from["artifacts"])}
+    if not here:
+        return
+    places = {**known.places, **here}
     content = {
         "schema": _SCHEMA, "made_from": known.made_from, "aliases": {k: dict(v) for k, v in aliases.items()},
         "places": {k: vars(p) for k, p in places.items()},

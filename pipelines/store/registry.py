@@ -466,10 +466,25 @@ def look_up(name: str, which: str, known: lookups.Registry, settings: Settings) 
     client = open_store(settings)
     with store_errors(settings):
         version = find_version(client, name, which)
-        aliases = {m.name: {a: str(n) for a, n in m.aliases.items()} for m in registered_models(client)}
+        aliases = _aliases(client)
     place = _place(version, settings)
-    lookups.keep(known, aliases, f"{name}/{version.version}", place, settings.home)
+    lookups.keep(known, aliases, {f"{name}/{version.version}": place}, settings.home)
     return place
+
+
+def remember(versions: Iterable[tuple[str, int]], settings: Settings) -> None:
+    """Keep where these versions (name, number) are, so that the commands after this one find them without MLflow.
+
+    Call it after the last write to the store: what is kept holds until the next.
+    """
+    known, client = lookups.kept(settings), open_store(settings)
+    with store_errors(settings):
+        found = {f"{n}/{v}": _place(client.get_model_version(n, str(v)), settings) for n, v in versions}
+        lookups.keep(known, _aliases(client), found, settings.home)
+
+
+def _aliases(client: MlflowClient) -> dict[str, dict[str, str]]:
+    return {m.name: {a: str(n) for a, n in m.aliases.items()} for m in registered_models(client)}
 
 
 def local_folder(uri: str, settings: Settings) -> str:

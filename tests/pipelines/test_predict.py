@@ -370,10 +370,10 @@ def test_nothing_is_kept_of_a_server_or_of_files_elsewhere(store, tmp_path):
     own, place = replace(store, home=tmp_path), lookups.Place(str(tmp_path / "download"), "")
     for changed in ({"store_uri": "http://127.0.0.1:1"}, {"artifacts_uri": "s3://bucket"}, {}):
         settings = replace(own, **changed)
-        lookups.keep(lookups.kept(settings), {"m": {}}, "m/1", place, settings.home)
+        lookups.keep(lookups.kept(settings), {"m": {}}, {"m/1": place}, settings.home)
         assert not lookups.kept(settings).aliases
     inside = replace(own, artifacts_uri=tmp_path.as_uri())
-    lookups.keep(lookups.kept(inside), {"m": {"champion": "1"}}, "m/1", place, tmp_path)
+    lookups.keep(lookups.kept(inside), {"m": {"champion": "1"}}, {"m/1": place}, tmp_path)
     assert lookups.kept(inside).place("m", "champion") == place
     (tmp_path / "registry.json").write_text("[]")
     assert lookups.kept(inside).place("m", "champion") is None

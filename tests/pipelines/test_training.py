@@ -21,7 +21,7 @@ from pipelines.commands.predict import predict_file
 from pipelines.jobs.recordings import load_batches
 from pipelines.jobs.request import TrainRequest
 from pipelines.jobs.training import TrainOutcome, promote_tracked, train
-from pipelines.store import registry, tracking
+from pipelines.store import lookups, registry, tracking
 from tests.toys.small_year import NOISE_UM, law_um, write_machine, write_year
 
 NAME = "small-train"
@@ -67,6 +67,7 @@ def story(home: Path, store: Any, tmp_path_factory: pytest.TempPathFactory) -> S
     step("zero", lambda: training(ZERO))
     step("zero again", lambda: training(ZERO))
     step("better", lambda: training(QUICK, report=folder / "out" / "better.html"))
+    step("known", lambda: lookups.kept(store))
     step("not new", lambda: training(QUICK, only_if_new=True))
     story.files += write_year(folder / "in", 1, first=6)
     step("season", lambda: training(QUICK, only_if_new=True))
@@ -190,6 +191,14 @@ def test_the_champion_predicts_a_raw_file(story: Story, store: Any, tmp_path: Pa
     assert len(got) == len(table)
     assert np.abs(got["predicted_um"] - law_um(table)).max() < 1.5
     assert got["simulated"].all()
+
+
+def test_the_next_command_needs_no_mlflow_to_find_the_champion(story: Story, store: Any) -> None:
+    place = story.steps["known"].place(MODEL, "champion")
+    assert place == story.steps["known"].place(MODEL, "2")
+    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    folder = registry.version_folder(client.get_model_version(MODEL, "2"), store)
+    assert Path(place.folder) == folder and place.sha256
 
 
 def test_progress_is_said(story: Story) -> None:
