@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -26,6 +26,7 @@ out = Console(soft_wrap=True, emoji=False)
 err = Console(stderr=True, soft_wrap=True, emoji=False)
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")  # all but tab and newline
 MIN_WRAPPED = 12  # characters
+WIDE = 120  # characters
 PLAIN_EVERY_S = 30.0  # between two lines of progress in a log: a long night gives a thousand
 MIN_FINISHED = 2  # items from which on an estimate is shown: the first may have waited for imports
 
@@ -33,6 +34,17 @@ MIN_FINISHED = 2  # items from which on an estimate is shown: the first may have
 def plain(text: object) -> str:
     """Without markup, and with what would steer a terminal or turn the text around spelt out."""
     return escape(_CONTROL.sub(lambda found: ascii(found[0])[1:-1], str(text)))
+
+
+@contextmanager
+def printing_to(file: TextIO) -> Iterator[None]:
+    """Results go into a file, so wide that tables are whole."""
+    global out
+    screen, out = out, Console(file=file, width=WIDE, soft_wrap=True, emoji=False)
+    try:
+        yield
+    finally:
+        out = screen
 
 
 def line(text: object) -> None:

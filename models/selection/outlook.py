@@ -41,15 +41,23 @@ class Outlook:
     @property
     def summary(self) -> str:
         """The warning, the number with its bound, leave-batch-out, and the note."""
-        where = "next season" if self.protocol == "forward" else f"by {self.protocol}"
-        number = f"expected error {where}: S {self.S_um:.2f} µm, 90 % of runs below {self.bound_um:.2f} µm"
         nested = ", each by the cell that the others chose" if self.nested else ""
-        parts = [self.warning, f"{number} ({self.protocol}, {self.n_runs} runs{nested})"]
+        parts = [self.warning, f"{self._number} ({self.protocol}, {self.n_runs} runs{nested})"]
         if self.nested:
             parts.append(f"the chosen cell itself, flattered by the choice, {self.cell_S_um:.2f} µm")
         if self.protocol != "leave-batch-out" and np.isfinite(self.leave_batch_out_um):
             parts.append(f"leave-batch-out {self.leave_batch_out_um:.2f} ± {self.leave_batch_out_std_um:.2f} µm")
         return "; ".join(p for p in [*parts, self.note] if p)
+
+    @property
+    def headline(self) -> str:
+        """The warning, and the number with its bound."""
+        return "; ".join(p for p in (self.warning, self._number) if p)
+
+    @property
+    def _number(self) -> str:
+        where = "next season" if self.protocol == "forward" else f"by {self.protocol}"
+        return f"expected error {where}: S {self.S_um:.2f} µm, 90 % of runs below {self.bound_um:.2f} µm"
 
     @property
     def nested(self) -> bool:

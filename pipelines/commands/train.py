@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from pipelines.jobs.training import TrainOutcome
 
+DETAILS = ".txt"  # next to the report
 SHOWN = 8  # families on the leaderboard
 _SHOWN_PROTOCOLS = {"forward": "forward", "leave-season-out": "season out", "leave-batch-out": "batch out"}
 
@@ -49,23 +50,65 @@ def training_dict(outcome: TrainOutcome) -> dict[str, Any]:
 
 
 def print_training(outcome: TrainOutcome) -> None:
-    """Ingest, findings, leaderboards, promotions, report, diagnosis and seconds."""
-    if outcome.ingested is not None:
-        print_ingest(outcome.ingested)
+    """One screen: a sentence for each error channel, what was lost, and where to look."""
     if outcome.stopped:
+        if outcome.ingested is not None:
+            print_ingest(outcome.ingested)
         console.line(outcome.stopped)
         return
-    account = outcome.account
+    for target in outcome.results:
+        console.line(in_error_unit(_sentence(outcome, target), outcome.units[target]))
+    if outcome.ingested is not None and (outcome.ingested.quarantined or outcome.ingested.waiting):
+        print_ingest(outcome.ingested)
+    if outcome.account:
+        console.line(outcome.account.summary)
+    if outcome.postponed:
+        console.line(f"postponed: {outcome.postponed}")
+    if outcome.diagnosis_summary:
+        console.line(f"diagnose {outcome.diagnosis_summary}")
+    console.line(f"report   {outcome.report}")
+    if outcome.report is not None:
+        details = outcome.report.with_suffix(DETAILS)
+        with details.open("w", encoding="utf-8") as file, console.printing_to(file):
+            print_details(outcome)
+        console.line(f"details  {details}")
+    console.line("seconds  " + ", ".join(f"{k} {v:g}" for k, v in outcome.seconds.items()))
+
+
+def _sentence(outcome: TrainOutcome, target: str) -> str:
+    """The error to expect of a channel, what no model leaves, and the model with what became of it."""
+    expected, choice = outcome.outlooks.get(target), outcome.choices.get(target)
+    promotion = outcome.promotions.get(target)
+    parts = [f"{_badge(outcome, target)}{expected.headline}"] if expected else []
+    cells = outcome.results[target].cells
+    zero = cells[(cells["family"] == "zero") & (cells["protocol"] == (choice.protocol if choice else ""))]
+    parts += [f"no model {zero['S_mean_um'].iloc[0]:.3g} µm"] if len(zero) else []
+    parts += [choice.name] if choice else []
+    if promotion is None:
+        parts.append(f"training {outcome.training_ids.get(target, 'not tracked')}")
+    elif promotion.outcome == "unchanged":
+        parts.append(promotion.summary)
+    else:
+        parts.append(f"{promotion.name} version {promotion.version} is {promotion.outcome}")
+    return f"{target}: {'; '.join(parts)}"
+
+
+def _badge(outcome: TrainOutcome, target: str) -> str:
+    """What was lost of a channel, and whether its choice is no champion."""
+    choice = outcome.choices[target]
+    standing = "provisional; " if choice.standing == "provisional" else ""
+    refused = "no trustworthy model; " if choice.caution and not standing else ""
+    return f"{outcome.account.warning(target) if outcome.account else ''}{standing}{refused}"
+
+
+def print_details(outcome: TrainOutcome) -> None:
+    """Ingest, how sure the expected errors are, leaderboards, promotions and what failing sensors cost."""
+    if outcome.ingested is not None:
+        print_ingest(outcome.ingested)
     label = "  (simulated recordings)" if outcome.simulated else ""
     for target, expected in outcome.outlooks.items():
-        choice = outcome.choices[target]
-        badge = (
-            "provisional; " if choice.standing == "provisional" else "no trustworthy model; " if choice.caution else ""
-        )
-        lost = account.warning(target) if account else ""
-        console.line(in_error_unit(f"{target}: {lost}{badge}{expected.summary}", outcome.units[target]))
-    if account:
-        console.line(account.summary)
+        text = f"{target}: {_badge(outcome, target)}{expected.summary}"
+        console.line(in_error_unit(text, outcome.units[target]))
     for target, result in outcome.results.items():
         _print_leaderboard(f"{outcome.machine} {target}{label}", result.cells, outcome.units[target])
     for target, training in outcome.training_ids.items():
@@ -74,12 +117,6 @@ def print_training(outcome: TrainOutcome) -> None:
         console.line(in_error_unit(said, outcome.units[target]))
         if promotion and promotion.faults:
             console.line(f"  {promotion.faults}")
-    if outcome.postponed:
-        console.line(f"postponed: {outcome.postponed}")
-    console.line(f"report   {outcome.report}")
-    if outcome.diagnosis_summary:
-        console.line(f"diagnose {outcome.diagnosis_summary}")
-    console.line("seconds  " + ", ".join(f"{k} {v:g}" for k, v in outcome.seconds.items()))
 
 
 def _shown_protocol(cells: pd.DataFrame) -> str:

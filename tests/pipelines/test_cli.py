@@ -50,10 +50,13 @@ def test_training_shows_what_came_of_it(year: Path, call: Call) -> None:
     done = call("train", "--machine", year / "small.yml", "--channels", "z", "--direct", "--families", "zero, ridge",
                 "--selectors", "none", "--protocols", "leave-batch-out", "--report", year / "r.md")  # fmt: skip
     assert done.code == 0
-    assert f"{NAME} z  (simulated recordings), S mean ± std, µm" in done.out
     assert lines(done.out)[0].startswith("z: expected error by leave-batch-out: S ")
-    assert all(word in done.out for word in ("ridge", "zero", "batch out", f"report   {year / 'r.md'}"))
-    assert "nothing new registered" in done.out
+    assert "; no model " in lines(done.out)[0] and "nothing new registered" in lines(done.out)[0]
+    assert all(f"{what} {year / name}" in done.out for what, name in (("report  ", "r.md"), ("details ", "r.txt")))
+    assert len(lines(done.out)) + len(lines(done.err)) < 24, "one screen"
+    details = (year / "r.txt").read_text(encoding="utf-8")
+    assert f"{NAME} z  (simulated recordings), S mean ± std, µm" in details and "nothing new registered" in details
+    assert all(word in details for word in ("ridge", "zero", "batch out"))
     assert (year / "r.md").exists()
     assert lines(done.err)[0] == "features and selectors of 6 batches"
 
