@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -15,7 +16,7 @@ from data.errors import InputError
 from features.design import Design
 from models.base import Family, inner_groups
 from models.metrics import SIDE_OF_90
-from models.numerics.batch_process import LeftOut
+from models.numerics.batch_process import INVERSE, LeftOut, Pooled
 from models.numerics.batches import too_few_rows
 from models.numerics.kernels import Kernel, evenly, from_origin, products, unit_scale
 from models.program import Builder
@@ -194,8 +195,9 @@ class GaussianProcess(Family):
 
 @dataclass(frozen=True)
 class _Problem:
-    """Rows in G groups of m places, 0 on padding: products of the inputs, y_um and known (n,), n = G m."""
+    """Rows in G groups of m places, 0 on padding: inputs u (n, p), their products, y_um and known (n,), n = G m."""
 
+    u: Array
     half: Array
     dot: Array
     to_origin: Array
@@ -220,7 +222,7 @@ class _Problem:
                 "check their units"
             )
         at = np.arange(n) // m
-        return cls(half, dot, _to_origin(u), not design.about_start, at[:, None] == at, y_um, known, m)
+        return cls(u, half, dot, _to_origin(u), not design.about_start, at[:, None] == at, y_um, known, m)
 
     def chosen(self, out: Sequence[int | None]) -> list[tuple[Setting, float]]:
         """Setting and noise in µm for each training set: all groups but one, or all of them (None)."""
@@ -244,8 +246,23 @@ class _Problem:
                     size_um[f] = _size_um(*self._residuals(left, out[f]))
         return list(zip(best, size_um.tolist(), strict=True))
 
-    def _left_out(self, setting: Setting) -> LeftOut | None:
+    @cached_property
+    def _lines(self) -> dict[float, LinesLeftOut]:
+        """By the variance of a batch's own line; empty where one inverse of all rows costs less than what replaces it:
+        a system of the inputs for every pair of groups."""
+        n_groups, p = len(self.known) // self.group_rows, self.u.shape[1] + self.free
+        if n_groups**2 * p**3 > INVERSE * len(self.known) ** 3:
+            return {}
+        u = self.u.reshape(n_groups, self.group_rows, -1) / np.sqrt(max(1, self.u.shape[1]))
+        known, y_um = (values.reshape(u.shape[:2]) for values in (self.known, self.y_um))
+        return {own_line: LinesLeftOut.of(u, y_um, known, own_line, self.free) for own_line in OWN_LINES}
+
+    def _left_out(self, setting: Setting) -> LeftOut | Line | None:
         """None where the covariance is beyond rounding."""
+        if setting.curve == 0.0 and setting.own_line in self._lines:
+            if not setting.line * np.abs(self.dot).max(initial=0.0) < _LOST:
+                return None
+            return Line(self._lines[setting.own_line], setting.line)
         covariance = setting.of_products(self.half, self.dot, self.to_origin, self.to_origin, self.free)
         covariance += self.same * setting.own(self.dot)
         covariance *= self.known[:, None] & self.known
@@ -253,13 +270,63 @@ class _Problem:
             return None
         return LeftOut.of(Kernel(covariance).inverse(1.0), self.y_um, self.group_rows)
 
-    def _residuals(self, left: LeftOut, f: int | None) -> tuple[Array, Array, Rows]:
+    def _residuals(self, left: LeftOut | Line, f: int | None) -> tuple[Array, Array, Rows]:
         """Residuals and their variances over the noise (rows,) of every group left out, and the rows' groups."""
         error, variance = left.alone() if f is None else left.without(f)
         judged = self.known.reshape(error.shape).copy()
         if f is not None:
             judged[f] = False
         return error[judged], variance[judged], np.nonzero(judged)[0].astype(np.int64)
+
+
+@dataclass(frozen=True)
+class LinesLeftOut:
+    """Whitened sums of every group for a Gaussian line through its rows: z (G, m, q) the inputs, and a constant where
+    the level is free, own (G, m) the variance of each row without the line."""
+
+    z: Array
+    y_um: Array
+    own: Array
+    pooled: Pooled
+    free: bool
+
+    @classmethod
+    def of(cls, u: Array, y_um: Array, known: NDArray[np.bool_], own_line: float, free: bool) -> Self:
+        """Of inputs u (G, m, p) over √p; a group has its own zero of variance 1, its own line, and noise."""
+        z = np.concatenate([u, np.ones((*u.shape[:2], 1))], axis=2) if free else u
+        z = z * known[:, :, None]
+        own = known[:, :, None] * known[:, None, :] * (1.0 + own_line * (u @ u.transpose(0, 2, 1)))
+        own += np.eye(own.shape[1])
+        table = np.concatenate([z, (y_um * known)[:, :, None]], axis=2)
+        white = np.linalg.solve(np.linalg.cholesky(own), table)
+        zt = white[:, :, :-1].transpose(0, 2, 1)
+        pooled = Pooled(zt @ white[:, :, :-1], (zt @ white[:, :, -1:])[:, :, 0])
+        return cls(z, y_um, np.einsum("gii->gi", own), pooled, free)
+
+
+@dataclass(frozen=True)
+class Line:
+    """The process of a line alone, with groups left out as in `LeftOut`: a regression on the other groups."""
+
+    lines: LinesLeftOut
+    variance: float
+
+    def alone(self) -> tuple[Array, Array]:
+        """Residual and variance (G, m) of each group left out by itself."""
+        return self._left_out(None)
+
+    def without(self, f: int) -> tuple[Array, Array]:
+        """Residual and variance (G, m) of each group when it and group f are left out; those of f mean nothing."""
+        return self._left_out(f)
+
+    def _left_out(self, f: int | None) -> tuple[Array, Array]:
+        s = self.lines
+        xx, xy = s.pooled.without(f)
+        prior = np.full(xx.shape[1], 1.0 / self.variance)
+        prior[len(prior) - s.free :] = 1.0
+        covariance = np.linalg.inv(xx + np.diag(prior))
+        gains = covariance @ xy[:, :, None]
+        return s.y_um - (s.z @ gains)[:, :, 0], s.own + ((s.z @ covariance) * s.z).sum(axis=2)
 
 
 _STEPS: tuple[Callable[[Setting], list[Setting]], ...] = (

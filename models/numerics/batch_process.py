@@ -24,7 +24,7 @@ from features.design import Design
 
 _WINDOW_S = 600.0
 _MOST_WINDOWS = 1200
-_INVERSE = 5.0  # cost of an inverse of N rows over N³, in units of a solved system of m columns over m³
+INVERSE = 5.0  # cost of an inverse of N rows over N³, in units of a solved system of m columns over m³
 _MISTRUST = 100.0  # drift variance of a batch that the others do not explain, relative to theirs
 
 
@@ -215,7 +215,7 @@ class BatchProcess(ABC):
         """
         wide = np.where(np.isin(windows.ids, list(mistrusted)), _MISTRUST, 1.0)
         pairs = len(windows.ids) ** 2 * float(np.count_nonzero(variance)) ** 3
-        way = ByColumns if pairs < _INVERSE * float(len(windows.y_um)) ** 3 else ByRows
+        way = ByColumns if pairs < INVERSE * float(len(windows.y_um)) ** 3 else ByRows
         return way(windows, variance, steady, wide)
 
     @abstractmethod

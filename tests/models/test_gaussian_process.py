@@ -10,7 +10,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, Wh
 from data.errors import InputError
 from features.design import Design
 from models.families import gaussian_process
-from models.families.gaussian_process import GaussianProcess, Setting
+from models.families.gaussian_process import OWN_LINES, GaussianProcess, Line, Setting, _Problem
 from models.numerics.batch_process import LeftOut
 from models.numerics.kernels import products
 
@@ -148,3 +148,21 @@ def test_what_cannot_be_learned_from_is_told():
     design = make_design(3)
     with pytest.raises(InputError, match=r"inputs reach 2e\+07 times their scale, expected about 1: check their units"):
         GaussianProcess().as_published().fit_design(replace(design, x=np.full_like(design.x, 2e8)), range(3))
+
+
+@pytest.mark.parametrize("own_line", OWN_LINES)
+@pytest.mark.parametrize("as_published", [False, True])
+def test_a_line_left_out_by_sums_is_what_the_whole_covariance_leaves_out(own_line: float, as_published: bool) -> None:
+    """Groups of different sizes, so that there is padding; each alone, and with another."""
+    design = make_design(4, own_slope=OWN_SLOPE_UM_PER_K)
+    design = design if as_published else design.started
+    rows = np.setdiff1d(np.arange(120), [3, 40, 41, 42, 100])
+    by_sums, whole = (_Problem.of(design, rows, design.group[rows]) for _ in range(2))
+    whole.__dict__["_lines"] = {}
+    setting = Setting(line=1e3, curve=0.0, own_line=own_line)
+    got, want = by_sums._left_out(setting), whole._left_out(setting)
+    assert isinstance(got, Line) and isinstance(want, LeftOut)
+    for f in (None, 0, 3):
+        parts = zip(by_sums._residuals(got, f), whole._residuals(want, f), strict=True)
+        for ours, theirs in parts:
+            np.testing.assert_allclose(ours, theirs, rtol=1e-7, atol=1e-7)
