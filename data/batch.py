@@ -108,12 +108,21 @@ class Batch:
         return tuple(n for n, c in self.channels.items() if c.role in roles)
 
     def values(self, name: str) -> NDArray[np.float64]:
-        """As recorded, in the canonical unit, shape (n,); NaN where nothing was recorded."""
+        """As recorded, in the canonical unit, shape (n,), read-only; NaN where nothing was recorded."""
+        if name in self._values:
+            return self._values[name]
         if name not in self.table.columns or name == "time_s":
             raise InputError(
                 f"batch {self.batch_id} of {self.machine}: no channel {name!r}; {closest(name, self.channels)}"
             )
-        return self.table[name].to_numpy(float)
+        values = self._values[name] = self.table[name].to_numpy(float)
+        values.flags.writeable = False
+        return values
+
+    @cached_property
+    def _values(self) -> dict[str, NDArray[np.float64]]:
+        """Columns that were read: a pandas table takes longer to give one than most of what is done with it."""
+        return {}
 
     def masked(self, name: str) -> NDArray[np.float64]:
         """As recorded, NaN inside every stretch that a finding masks, shape (n,)."""
