@@ -37,7 +37,7 @@ Cell = tuple[str, int]  # of a family: selector and number of points
 Effort = Literal["quick", "usual", "complete"]
 # Cells that are scored by all folds; `complete` scores all. More of them cost time in proportion and change little.
 FINALISTS: Mapping[Effort, int] = {"quick": 12, "usual": 36, "complete": 0}
-NETS = "torch"  # what families of networks need
+NETS = "torch"  # what families and selectors that train networks need
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,7 @@ class Plan:
     left_out: tuple[tuple[str, str], ...] = ()  # what cannot run here, and why
     finalists: int | None = None  # 0: no race; None: not yet known, see `suited`
     late: tuple[str, ...] = ()  # families that a race tries only where the others leave much
+    late_selectors: tuple[str, ...] = ()  # selectors likewise
 
     def suited(self, machine: Machine | None, channels: Sequence[Channel] = ()) -> Plan:
         """The plan with its selectors and families by name; `channels` are the error channels that it is for.
@@ -86,13 +87,17 @@ class Plan:
         suitable = [f for f in suitable if not FAMILIES[f].on_request]
         selectors, without = _runnable("selector", SELECTORS, self.selectors or tuple(SELECTORS))
         families, more = _runnable("family", FAMILIES, self.families or tuple(suitable))
-        nets = [f for f in families if self.effort == "quick" and NETS in FAMILIES[f].packages]
-        late = self.late if self.families else tuple(nets)
+        quick = self.effort == "quick"
+        slow = [f for f in families if quick and (NETS in FAMILIES[f].packages or FAMILIES[f].needs_twin)]
+        nets = [s for s in selectors if quick and NETS in SELECTORS[s].packages]
+        late = self.late if self.families else tuple(slow)
+        late_selectors = self.late_selectors if self.selectors else tuple(nets)
         named = bool(self.selectors and self.families)
         finalists = self.finalists if self.finalists is not None else 0 if named else FINALISTS[self.effort]
         protocols = self.protocols or tuple(p for p in PROTOCOLS if not (finalists and p in STUDIED))
         return replace(self, selectors=selectors, families=families, protocols=protocols, finalists=finalists,
-                       left_out=(*self.left_out, *without, *more), late=late)  # fmt: skip
+                       left_out=(*self.left_out, *without, *more), late=late,
+                       late_selectors=late_selectors)  # fmt: skip
 
     def points(self, family: type[Family], n_inputs: int) -> tuple[int, ...]:
         """The numbers of points a family is tried with."""

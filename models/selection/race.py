@@ -15,8 +15,9 @@ and Talwalkar 2016): the best first, by their mean S with the cost of choosing, 
 (`models.selection.loss`), of each family no more than a part of them. The best cells of the four best families go on
 in any case, as runners-up and members of a stack, and so do the baselines. Of the families that simulate the twin one
 goes on only if it leads, since its folds take minutes. Unless the effort is "quick", the best cell of the twin stays
-until the third round: a growing error of the twin calls for a diagnosis. With "quick" families of networks are tried
-only where all others leave much more than the noise of the error.
+until the third round: a growing error of the twin calls for a diagnosis. With "quick", families that simulate the twin
+and families and selectors that train networks are tried only where all others leave much more than the noise of the
+error.
 """
 
 from __future__ import annotations
@@ -44,8 +45,11 @@ _FIRST_POINTS = ("correlation", 4)  # next to all points: least squares on all o
 # Relative difference of S on every run below which two cells are one model: nets that learned a linear map.
 _SAME = 0.02
 _FAMILIES_KEPT, _SELECTORS_KEPT = 8, 4  # after the first and the second round
-_MUCH = 5.0  # noises of the error: as long as all other families leave more, networks are tried in a quick race too
-_LATE = f"networks are tried where all others leave more than {_MUCH:g} noises of the error, or with effort usual"
+_MUCH = 5.0  # noises of the error: as long as all other families leave more, a quick race tries the late ones too
+_LATE = (
+    f"the twin and networks are tried where all others leave more than {_MUCH:g} noises of the error, or with effort"
+    " usual"
+)
 _CELLS_PER_FINALIST = 4  # cells of the third round for every finalist
 _RUNNERS_UP = 4  # families that are in every round
 _FAMILY_SHARE = 4  # a family has a quarter of the places at most: a stack needs unlike members
@@ -104,10 +108,12 @@ def rounds(crossing: Crossing) -> Rounds:
     twin = crossing.plan.effort != "quick"
     late = {key: own for key, own in cells.items() if key in crossing.plan.late}
     first = yield _jobs(crossing, "families", {key: cells[key] for key in cells if key not in late}, few, keep=False)
-    untried = late
-    if late and _least_um(first) > _MUCH * _noise_um(crossing.design):
-        first += yield _jobs(crossing, "networks", late, few, keep=False)
-        untried = {}
+    untried = [*(("family", f) for f in late), *(("selector", s) for s in crossing.plan.late_selectors)]
+    if untried and _least_um(first) > _MUCH * _noise_um(crossing.design):
+        first += yield _jobs(crossing, "late", late, few, keep=False)
+        untried = []
+    without = {key for kind, key in untried if kind == "selector"}
+    every = {key: tuple(c for c in own if c[0] not in without) for key, own in every.items()}
     left = _kept(first, "families", _FAMILIES_KEPT, table, twin, most=1)
     kept = {key for _, key, _ in left}
     more = {key: _tried(every[key], crossing) for key in every if key in kept}
@@ -127,7 +133,7 @@ def rounds(crossing: Crossing) -> Rounds:
     rest = {p: own for p, own in folds.items() if p != led}
     last = yield _jobs(crossing, "finalists", _by_family(left), rest) if rest else []
     found = FamilyResult.joined([*third, *last])
-    found.failures.extend((f"family {key}", _LATE) for key in untried)
+    found.failures.extend((f"{kind} {key}", _LATE) for kind, key in untried)
     return _with_stack(crossing, found, pd.concat(table, ignore_index=True), led)
 
 

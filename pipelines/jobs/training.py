@@ -288,7 +288,7 @@ def _kept(checkpoint: Checkpoint) -> Iterator[None]:
 def _record(
     outcome: TrainOutcome, plan: Plan, settings: Settings, target: str, record_id: str, started_ms: int
 ) -> Record:
-    plain = {k: v if isinstance(v, tuple) else (v,) for k, v in asdict(plan).items() if k != "late"}
+    plain = {k: v if isinstance(v, tuple) else (v,) for k, v in asdict(plan).items() if not k.startswith("late")}
     params = {k: ", ".join(map(str, v or ("all",))) for k, v in plain.items()} | {"unit": outcome.units[target]}
     return tracking.training_record(
         outcome.results[target], settings.promotion, params, choice=outcome.choices.get(target), record_id=record_id,

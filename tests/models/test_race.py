@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from data.errors import InputError
+from data.machine import load_machine
 from models.families import FAMILIES as REGISTERED
 from models.protocols import PromotionRule
 from models.selection.crossing import Plan, prepare, refit
@@ -138,6 +140,21 @@ def test_networks_enter_a_quick_race_only_where_others_leave_much(toy_batches, m
     raced = drive({"z": crossing}, lambda jobs: [job.run(crossing) for job in jobs])["z"]
     assert ("gru" in set(raced.race["family"])) == (noise_um == 0.0)
     assert ("family gru" in dict(raced.result.failures)) == (noise_um > 0.0)
+
+
+def test_the_twin_and_selectors_that_train_networks_enter_a_quick_race_late(toy_batches, monkeypatch):
+    machine = load_machine(Path(__file__).parents[2] / "machines" / "sample_vmc.yml")
+    quick, usual = (Plan(effort=effort).suited(machine) for effort in ("quick", "usual"))
+    twins = {f for f in usual.families if REGISTERED[f].needs_twin}
+    assert twins and twins < set(quick.late) and quick.late_selectors == ("main_factor_bp",)
+    assert not usual.late and not usual.late_selectors and quick.suited(machine) == quick
+    assert not Plan(("main_factor_bp",), effort="quick").suited(machine).late_selectors
+    monkeypatch.setattr("models.selection.race._noise_um", lambda design: 1000.0)
+    plan = Plan(families=("zero", "mlr", "ridge"), effort="quick")
+    crossing = prepare(toy_batches(6), "z", plan)
+    raced = drive({"z": crossing}, lambda jobs: [job.run(crossing) for job in jobs])["z"]
+    assert "selector main_factor_bp" in dict(raced.result.failures)
+    assert "main_factor_bp" not in set(raced.race["selector"]) and "fcgc" in set(raced.race["selector"])
 
 
 def test_the_noise_of_an_error_is_known_from_its_second_differences():
