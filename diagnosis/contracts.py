@@ -298,7 +298,8 @@ class Tried:
     """A candidate after its full refit; `gain` in nats of log evidence over the fit before.
 
     `by_run` (B,) is what each left-out batch gains, `cluster` the first of the candidates that these recordings cannot
-    distinguish, `log_prior` of its law and of the equipment that it needs.
+    distinguish, `log_prior` of its law and of the equipment that it needs. Where it is `confirmed`, the gain is
+    the lesser under two structures: that of the fit before, and the one that is drawn anew about either fit.
     """
 
     scored: Scored
@@ -307,6 +308,7 @@ class Tried:
     by_run: Array
     cluster: str
     log_prior: float
+    confirmed: bool = False
 
     @property
     def candidate(self) -> Candidate:

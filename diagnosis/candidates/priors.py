@@ -1,4 +1,4 @@
-"""Priors of candidates: the usual size of an amplitude, and where its fit starts."""
+"""Priors of candidates: the usual size of an amplitude, and how far it may be from that."""
 
 from __future__ import annotations
 
@@ -40,33 +40,22 @@ def at_size(spec: Spec, size: float) -> Spec:
     return replace(spec, value=float(np.clip(spec.value * size, spec.low, spec.high)))
 
 
-def start_values(s: Scored, now: Point) -> tuple[Mapping[str, Value], Mapping[str, float]]:
-    """A candidate's free values with priors, and parameter values by network name where its fit begins.
+def free_values(s: Scored, now: Point) -> Mapping[str, Value]:
+    """A candidate's free values with priors, by parameter; none where it changes a value or exchanges labels.
 
-    The prior's centre is the usual value, its spread wide; the fit begins at the amplitude that the screen found.
+    The prior's centre is the usual value; its spread is wide, and wider where the screen shows an unusual amplitude.
     """
     c = s.candidate
-    if c.change is not None:
-        name = c.change.parameter.name
-        value = c.change.parameter.value
-        most = POLICY.start_max_log_factor
-        factor = float(np.exp(np.clip(s.amplitudes.get("factor", 0.0), -most, most)))
-        p = c.change.parameter
-        margin = POLICY.start_share_margin if p.scale == "logit" else 0.0  # no share begins at 0 or 1: its logit is ∞
-        begin = float(np.clip(value * factor, p.low + margin, p.high - margin))
-        return {}, {name: begin}
-    mechanism = MECHANISMS[c.mechanism]
+    if c.mechanism not in MECHANISMS:
+        return {}
+    mechanism, size = MECHANISMS[c.mechanism], size_of(now)
     values: dict[str, Value] = {}
-    at: dict[str, float] = {}
-    size = size_of(now)
     found = _in_proportion(s, size)
     for amplitude, off in c.amplitudes.items():
         spec = at_size(mechanism.spec(amplitude), size)
         if mechanism.any_unit:  # per unit of whatever drives it: no size is usual
             spec = replace(spec, spread=POLICY.unusual_size_factor * s.prior / POLICY.signed_prior_sd_factor)
-        begin = off + found.get(amplitude, 0.0)
-        values[amplitude], begin = _free(spec, off, begin)
-        at[f"mechanisms.{c.name}.{amplitude}"] = begin
+        values[amplitude], begin = _free(spec, off, off + found.get(amplitude, 0.0))
         if "expand" in mechanism.effects():  # it is elsewhere in the network, under another name
             usual = values[amplitude].value
             values[amplitude] = values[amplitude].model_copy(update={"value": _said(begin, spec.unit), "prior": usual})
@@ -79,7 +68,7 @@ def start_values(s: Scored, now: Point) -> tuple[Mapping[str, Value], Mapping[st
             for p in mechanism.parameters
             if p.value is not None and p.spread is not None
         }
-    return values, at
+    return values
 
 
 def _in_proportion(s: Scored, size: float) -> dict[str, float]:
@@ -91,11 +80,6 @@ def _in_proportion(s: Scored, size: float) -> dict[str, float]:
     ((name, value),) = found.items()
     share = value / (specs[name].value or 1.0) / len(specs)
     return {a: share * (spec.value or 0.0) for a, spec in specs.items()}
-
-
-def free_values(s: Scored, now: Point) -> Mapping[str, Value]:
-    """A candidate's free values with priors; none where it changes a value or exchanges labels."""
-    return start_values(s, now)[0] if s.candidate.mechanism in MECHANISMS else {}
 
 
 def _free(spec: Spec, off: float, begin: float) -> tuple[Value, float]:

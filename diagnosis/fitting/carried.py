@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -92,25 +92,18 @@ def _beside(network: Network, start: Array, cells: NDArray[np.int64]) -> Array:
     return np.asarray(start[:, int(np.argmax(conductance))])
 
 
-def carried_start(
-    old: Point, part: TwinPart, at: Mapping[str, float] | None = None
-) -> tuple[CalibrationProblem, Array, list[Array]]:
-    """The problem of a changed twin part, and z (p,) and the batches' own unknowns where its fit begins.
-
-    `at` gives start values by parameter name; other new parameters start at their value in the part.
+def carried_start(old: Point, part: TwinPart) -> tuple[CalibrationProblem, Array, list[Array]]:
+    """The problem of a changed twin part, and z (p,) and the batches' own unknowns where a fit from the old one begins;
+    new parameters start at their value in the part.
 
     Raises:
         InputError: the part does not compile.
     """
     network = compile_network(old.machine, part=part)
     problem = on_network(old.problem, old.batches, network, free_starts=True)
-    z = carried_z(old.problem, problem, old.z)
-    known = {u.name for u in old.problem.unknowns}
-    for k, u in enumerate(problem.unknowns):
-        p = network.parameters[network.index(u.name)]
-        begin = at.get(u.name) if at else None
-        if begin is None and u.name not in known:
-            begin = p.value
-        if begin is not None:
-            z[k] = (float(p.to_x(begin)) - u.prior) / u.spread
+    begin = [
+        (float(p.to_x(p.value)) - u.prior) / u.spread
+        for u, p in ((u, network.parameters[network.index(u.name)]) for u in problem.unknowns)
+    ]
+    z = carried_z(old.problem, problem, old.z, np.array(begin))
     return problem, z, carried_nuisances(old.problem, problem, old.nuisance)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -91,9 +91,8 @@ def baseline(
     )
     batches = coarse(batches, every_s, lead_rows)
     at = Point(machine, part, tuple(batches), problem, state.z, state.nuisance, lead_rows)
-    rng = np.random.default_rng(seed)
     first = POLICY.refined_twins // 2
-    drawn = _structure(at, first, rng, tell)
+    drawn = _structure(at, first, seed, tell)
     covariance = rough(problem, [POLICY.rough_structure_factor / np.sqrt(first) * d for d in drawn])
     tell("baseline", 2, 3)
     at = _fitted(_begun(at, covariance, Hyper(), runs))
@@ -107,8 +106,8 @@ def structured(at: Point, runs: int, seed: int = 0, tell: Callable[[str, int, in
     Raises:
         WorkError: no refined twin can be simulated.
     """
-    problem, rng = at.problem, np.random.default_rng(seed)
-    drawn = _structure(at, POLICY.refined_twins, rng, tell)
+    problem = at.problem
+    drawn = _structure(at, POLICY.refined_twins, seed, tell)
     blocks = list(problem.linearise(at.x, at.nuisance))
     known = beyond_recalibration(blocks, _spread(problem.unknowns), imperfections(at))
     structure = Structure(drawn, known, white_noise(problem))
@@ -137,6 +136,18 @@ def relearned(fitted: Fitted) -> Fitted:
     are likeliest now: those of the fit before may have stood in for an effect."""
     done = replace(_under_own(fitted, fitted, fitted.hyper), base=fitted.base)
     return done if done.log_evidence > fitted.log_evidence else fitted
+
+
+def refitted(now: Fitted, part: TwinPart) -> Fitted:
+    """The recordings of a fit explained by a changed twin part, from the values of the fit on: another optimum than
+    `afresh` may find.
+
+    Raises:
+        InputError: the part does not compile; WorkError: it cannot be simulated there.
+    """
+    problem, z, nuisance = carried_start(now, part)
+    at = Point(now.machine, part, now.batches, problem, z, nuisance, now.lead_rows)
+    return replace(_under_own(now, at, now.hyper), base=now)
 
 
 def afresh(now: Fitted, part: TwinPart) -> Fitted:
@@ -176,7 +187,7 @@ def _learned(begun: Fitted) -> Fitted:
     return fitted
 
 
-def _structure(at: Point, draws: int, rng: np.random.Generator, tell: Callable[[str, int, int], None]) -> list[Array]:
+def _structure(at: Point, draws: int, seed: int, tell: Callable[[str, int, int], None]) -> list[Array]:
     """Misfits of refined twins (n_b, draws) beyond what a recalibration takes.
 
     A fit that lacks an effect can have values that no machine has, about which few twins can be simulated: they are
@@ -187,9 +198,9 @@ def _structure(at: Point, draws: int, rng: np.random.Generator, tell: Callable[[
         tell("refined twins", n, of)
 
     def about(at: Point) -> list[Array]:
-        drawn = drawn_misfits(at.machine, at.part, at.batches, at.problem, at.values, draws, rng, progress)
+        drawn = drawn_misfits(at.machine, at.part, at.batches, at.problem, at.values, draws, seed, progress)
         films = rising_films(at)  # linear about the fit: a film in every twin takes no simulation of its own
-        sizes = np.abs(rng.standard_normal((films[0].shape[1], draws)))
+        sizes = np.abs(np.random.default_rng(seed).standard_normal((films[0].shape[1], draws)))
         drawn = [d + f @ sizes for d, f in zip(drawn, films, strict=True)]
         blocks = list(at.problem.linearise(at.x, at.nuisance))
         return clipped(beyond_recalibration(blocks, _spread(at.problem.unknowns), drawn))
@@ -268,76 +279,25 @@ def under(fitted: Fitted, covariance: Covariance) -> Fitted:
     return _fitted(_begun(fitted, covariance, fitted.hyper, fitted.runs))
 
 
-Model = Callable[[Array], list[Array]]  # the whitened derivatives (n_b, p) of every batch at z
-
-
-def relinearised(fitted: Fitted, steps: int = POLICY.fit_steps) -> Fitted:
-    """The fit at its optimum, with all derivatives taken anew at every step."""
-    return _descended(fitted, _anew(fitted), steps)
-
-
-def _anew(fitted: Fitted) -> Model:
-    problem, marginal, spread = fitted.problem, fitted.marginal, _spread(fitted.problem.unknowns)
-
-    def model(z: Array) -> list[Array]:
-        blocks = problem.linearise(x_of(problem.unknowns, z), fitted.nuisance)
-        return marginal.white([block.jacobian * spread for block in blocks])
-
-    return model
-
-
-def tuned(fitted: Fitted, model: Model | None = None, steps: int = POLICY.fit_steps) -> Fitted:
+def tuned(fitted: Fitted) -> Fitted:
     """The fit under the hyperparameters that are likeliest for it, at its optimum there."""
     for _ in range(POLICY.hyper_rounds):
         hyper, _ = fitted.marginal.likeliest(fitted.grams, fitted.hyper)
         if hyper == fitted.hyper:
             break
-        fitted = _descended(replace(fitted, hyper=hyper), model or _anew(fitted), steps)
+        fitted = relinearised(replace(fitted, hyper=hyper))
     return fitted
 
 
-def refitted(
-    now: Fitted, part: TwinPart, at: Mapping[str, float] | None = None, steps: int = POLICY.fit_steps
-) -> Fitted:
-    """The same recordings fitted by a changed twin part, starting from a fit, under its own hyperparameters.
-
-    Only what is new is linearised anew at every step: the derivatives by parameters that both share are those of the
-    fit before (a chord). `at` gives start values by parameter name; other new parameters start at their value.
-
-    Raises:
-        InputError: the part does not compile; WorkError: it cannot be simulated there.
-    """
-    problem, z, nuisance = carried_start(now, part, at)
-    known = {u: k for k, u in enumerate(now.problem.unknowns)}
-    kept = [k for k, u in enumerate(problem.unknowns) if u in known]
-    new = [k for k, u in enumerate(problem.unknowns) if u not in known]
-    before = [known[problem.unknowns[k]] for k in kept]
-    numbers, spread = [int(problem.network.free[k]) for k in new], _spread(problem.unknowns)
-
-    def model(z: Array) -> list[Array]:
-        out = [np.empty((len(columns), len(z))) for columns in now.columns]
-        for own, columns in zip(out, now.columns, strict=True):
-            own[:, kept] = columns[:, before]
-        if new:
-            slopes = problem.columns(x_of(problem.unknowns, z), nuisance, numbers)
-            for own, slope in zip(out, now.marginal.white([x * spread[new] for x in slopes]), strict=True):
-                own[:, new] = slope
-        return out
-
-    z = np.clip(z, *z_bounds(problem.unknowns))
-    begun = replace(now, part=part, problem=problem, z=z, nuisance=nuisance, base=now)
-    return tuned(_descended(begun, model, steps), model, steps)
-
-
-def _descended(fitted: Fitted, model: Model, steps: int) -> Fitted:
-    """Gauss-Newton from a fit, with the whitened `model` (n_b, p) of every batch at z; a step is shortened until the
+def relinearised(fitted: Fitted, steps: int = POLICY.fit_steps) -> Fitted:
+    """The fit at its optimum: Gauss-Newton with all derivatives taken anew at every step, which is shortened until the
     posterior rises (Levenberg and Marquardt).
 
     Raises:
         WorkError: not finite at the start.
     """
     problem, marginal, level, z = fitted.problem, fitted.marginal, fitted.level, fitted.z
-    low, high = z_bounds(problem.unknowns)
+    (low, high), spread = z_bounds(problem.unknowns), _spread(problem.unknowns)
 
     def rows(z: Array) -> tuple[list[Array], float]:
         """Whitened rows left over at z, and twice the negative log posterior up to a constant."""
@@ -350,7 +310,9 @@ def _descended(fitted: Fitted, model: Model, steps: int) -> Fitted:
             return white, float(level.reduced(grams)[0, 0] + level.prior * (z @ z))
 
     def at(z: Array, left: Sequence[Array]) -> Fitted:
-        columns = [np.column_stack([own, r + own @ z]) for own, r in zip(model(z), left, strict=True)]
+        blocks = problem.linearise(x_of(problem.unknowns, z), fitted.nuisance)
+        model = marginal.white([block.jacobian * spread for block in blocks])
+        columns = [np.column_stack([own, r + own @ z]) for own, r in zip(model, left, strict=True)]
         return replace(fitted, z=z, columns=columns)
 
     left, cost = rows(z)

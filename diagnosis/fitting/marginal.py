@@ -16,6 +16,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from data.arrays import Array
+from data.errors import WorkError
 from diagnosis.fitting.covariance import Covariance
 from diagnosis.policy import POLICY
 
@@ -145,7 +146,11 @@ class Marginal:
 
 
 class Level:
-    """A `Marginal` at one set of hyperparameters."""
+    """A `Marginal` at one set of hyperparameters.
+
+    Raises:
+        WorkError: derivatives that no machine has.
+    """
 
     def __init__(self, of: Marginal, hyper: Hyper) -> None:
         self.of, covariance = of, of.covariance
@@ -154,10 +159,13 @@ class Level:
         self.prior = 1.0 / hyper.values**2  # precision of the model's parameters z
         self.size = size
         self.own_size = [hyper.own_sizes(len(n), of.starts) for n in of.own_own]
-        self._root = [
-            np.linalg.cholesky(n * s * s[:, None] + np.eye(len(n)))
-            for n, s in zip(of.own_own, self.own_size, strict=True)
-        ]
+        try:
+            self._root = [
+                np.linalg.cholesky(n * s * s[:, None] + np.eye(len(n)))
+                for n, s in zip(of.own_own, self.own_size, strict=True)
+            ]
+        except np.linalg.LinAlgError:
+            raise WorkError("the starts of the runs are where the twin cannot be linearised") from None
         self._taken = [self.beyond(b, d) * size for b, d in enumerate(of.own_along)]
         self._volume = np.array([2.0 * float(np.log(np.diag(r)).sum()) for r in self._root]) + covariance.log_det
 

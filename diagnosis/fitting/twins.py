@@ -9,7 +9,8 @@ Kaipio and Somersalo 2007, J. Comput. Appl. Math. 198, 493; model discrepancy, K
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from zlib import crc32
 
 import numpy as np
 
@@ -28,7 +29,21 @@ from twin.quantity import Value
 from twin.schema import Body, ErrorChain, Link, MechanismPart, TwinPart
 from twin.simulation import simulate
 
-Rng = np.random.Generator
+
+@dataclass(frozen=True)
+class Dice:
+    """Random numbers of one refined twin, of each by the name of what it is drawn for.
+
+    Machines that differ by an effect are refined alike in all else, so that evidence under the one's twins and the
+    other's differs by the effect and not by chance (common random numbers, Kahn and Marshall 1953, J. Oper. Res. Soc.
+    Am. 1, 263).
+    """
+
+    seed: int
+    twin: int
+
+    def of(self, *name: str) -> np.random.Generator:
+        return np.random.default_rng([self.seed, self.twin, crc32(".".join(name).encode())])
 
 
 def drawn_misfits(
@@ -38,7 +53,7 @@ def drawn_misfits(
     problem: CalibrationProblem,
     values: Array,
     draws: int,
-    rng: Rng,
+    seed: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Array]:
     """What `draws` refined twins about parameter values (n,) show beyond the lumped one, (n_b, draws) of every batch in
@@ -49,9 +64,9 @@ def drawn_misfits(
     """  # fmt: skip
     out: list[list[Array]] = []
     usual_W = _usual_W(problem, values)
-    for _ in range(4 * draws):
+    for k in range(4 * draws):
         try:
-            out.append(_misfit(machine, part, batches, problem, values, usual_W, rng))
+            out.append(_misfit(machine, part, batches, problem, values, usual_W, Dice(seed, k)))
         except (InputError, WorkError):
             continue  # a draw that no machine has
         if progress:
@@ -71,24 +86,26 @@ def _misfit(
     problem: CalibrationProblem,
     values: Array,
     usual_W: Mapping[str, float],
-    rng: Rng,
+    dice: Dice,
 ) -> list[Array]:
     """One refined twin less the lumped one with the same totals, (n_b,) of every batch."""
     network = problem.network
     lumped, drawn = values.copy(), values.copy()
     for j, p in enumerate(network.parameters):
         if p.free and p.scale == "log" and drawn[j] > 0:
-            lumped[j] = drawn[j] = drawn[j] * np.exp(rng.normal(0.0, POLICY.drawn_value_log_sd))
-    finer, cut = refined(part, network, drawn, rng)
-    fine = on_network(problem, batches, _bent(compile_network(machine, part=finer), usual_W, rng))
+            lumped[j] = drawn[j] = drawn[j] * np.exp(dice.of("value", p.name).normal(0.0, POLICY.drawn_value_log_sd))
+    finer, cut = refined(part, network, drawn, dice)
+    fine = on_network(problem, batches, _bent(compile_network(machine, part=finer), usual_W, dice))
     known = {p.name: v for p, v in zip(network.parameters, drawn, strict=True)}
     own = np.array([known.get(p.name, v) for p, v in zip(fine.network.parameters, fine.network.values, strict=True)])
     n = len(batches)
     for body in cut:  # what a machine has done before leaves gradients
         cells = fine.network.bodies[body]
         sd_K = max(POLICY.start_gradient_min_sd_K, POLICY.start_gradient_share * network.start_spread_K)
-        fine.start_degC[:, cells] += rng.normal(0.0, sd_K, (n, 1)) * np.linspace(-1.0, 1.0, len(cells))
-    scatter = {h.law.name: np.exp(rng.normal(0.0, POLICY.run_to_run_log_sd, n)) for h in network.heats if not h.asleep}
+        across_K = dice.of("start", body).normal(0.0, sd_K, (n, 1))
+        fine.start_degC[:, cells] += across_K * np.linspace(-1.0, 1.0, len(cells))
+    laws = [h.law.name for h in network.heats if not h.asleep]
+    scatter = {name: np.exp(dice.of("run", name).normal(0.0, POLICY.run_to_run_log_sd, n)) for name in laws}
     return [f - g for f, g in zip(_shown(fine, own, scatter), _shown(problem, lumped, {}), strict=True)]
 
 
@@ -100,13 +117,16 @@ def _usual_W(problem: CalibrationProblem, values: Array) -> dict[str, float]:
     return {name: float(np.sqrt(np.mean(w**2))) for name, w in flowing.items() if len(w)}
 
 
-def _bent(network: Network, usual_W: Mapping[str, float], rng: Rng) -> Network:
+def _bent(network: Network, usual_W: Mapping[str, float], dice: Dice) -> Network:
     """The network whose heats grow with their drivers by other powers than their laws state."""
+
+    def exponent(name: str) -> float:
+        return float(np.exp(dice.of("exponent", name).normal(0.0, POLICY.drawn_exponent_log_sd)))
+
     heats = tuple(
-        replace(h, bent=(usual_W[h.law.name], float(np.exp(rng.normal(0.0, POLICY.drawn_exponent_log_sd)))))
-        if h.law.name in usual_W else h
+        replace(h, bent=(usual_W[h.law.name], exponent(h.law.name))) if h.law.name in usual_W else h
         for h in network.heats
-    )  # fmt: skip
+    )
     return replace(network, heats=heats)
 
 
@@ -118,7 +138,7 @@ def _shown(problem: CalibrationProblem, values: Array, scatter: Mapping[str, Arr
     return [m.of(s) / problem.noise[m.channel] for m, s in zip(problem.measured, series, strict=True)]
 
 
-def refined(part: TwinPart, network: Network, values: Array, rng: Rng) -> tuple[TwinPart, list[str]]:
+def refined(part: TwinPart, network: Network, values: Array, dice: Dice) -> tuple[TwinPart, list[str]]:
     """A twin part whose lumps are chains of cells with inner resistance, and the bodies that were cut; links, heats and
     sensors stand anywhere in them. Its parameters keep their names."""
     total = network.conductance_W_per_K(values)
@@ -129,6 +149,7 @@ def refined(part: TwinPart, network: Network, values: Array, rng: Rng) -> tuple[
     cut = [name for name, body in part.bodies.items() if body.shape == "lump" and name in joined]
     for name in cut:
         (cell,) = network.bodies[name]
+        rng = dice.of("body", name)
         thin = rng.random() < POLICY.thin_body_share
         median, log_sd = POLICY.thin_body_conductance if thin else POLICY.inner_conductance
         through[name] = float(total[cell, cell]) * float(np.exp(rng.normal(np.log(median), log_sd)))
@@ -137,8 +158,8 @@ def refined(part: TwinPart, network: Network, values: Array, rng: Rng) -> tuple[
             update={"shape": "bar", "cells": cells, "conductance": Value(value=f"{through[name]:.6g} W/K")}
         )
 
-    def place(at: str, low: float = 0.0, high: float = 1.0) -> str:
-        return f"{at}@{rng.uniform(low, high):.3f}" if at in cut else at
+    def place(of: str, at: str, low: float = 0.0, high: float = 1.0) -> str:
+        return f"{at}@{dice.of('place', of, at).uniform(low, high):.3f}" if at in cut else at
 
     near: dict[str, list[str]] = {}
     for link in part.links.values():
@@ -146,24 +167,25 @@ def refined(part: TwinPart, network: Network, values: Array, rng: Rng) -> tuple[
         near.setdefault(one, []).append(other)
         near.setdefault(other, []).append(one)
     links = {
-        key: link.model_copy(update={"between": (place(link.between[0]), place(link.between[1]))})
+        key: link.model_copy(update={"between": (place(key, link.between[0]), place(key, link.between[1]))})
         for key, link in part.links.items()
     }
     update = {
         "bodies": bodies,
-        "links": links | _webs(bodies, cut, through, rng) | _stray(near, network, total, place, rng),
-        "sensors": {key: s.model_copy(update={"at": place(s.at)}) for key, s in part.sensors.items()},
-        "mechanisms": {key: _placed(m, place, near, rng) for key, m in part.mechanisms.items()},
-        "errors": {key: _seen(chain, place) for key, chain in part.errors.items()},
+        "links": links | _webs(bodies, cut, through, dice) | _stray(near, network, total, place, dice),
+        "sensors": {key: s.model_copy(update={"at": place(key, s.at)}) for key, s in part.sensors.items()},
+        "mechanisms": {key: _placed(key, m, place, near, dice) for key, m in part.mechanisms.items()},
+        "errors": {key: _seen(key, chain, place) for key, chain in part.errors.items()},
     }
     return part.model_copy(update=update), cut
 
 
-def _webs(bodies: Mapping[str, Body], cut: Sequence[str], through: Mapping[str, float], rng: Rng) -> dict[str, Link]:
+def _webs(bodies: Mapping[str, Body], cut: Sequence[str], through: Mapping[str, float], dice: Dice) -> dict[str, Link]:
     """Paths within the castings in addition to the chain, in one draw of two."""
     out = {}
-    if rng.random() < POLICY.webbed_share:
+    if dice.of("webs").random() < POLICY.webbed_share:
         for name in cut:
+            rng = dice.of("web", name)
             cells = int(bodies[name].cells)  # type: ignore[arg-type]
             for k in range(cells):
                 one, other = (rng.permutation(cells)[:2] + 0.5) / cells  # of two cells: a link needs two ends
@@ -173,7 +195,7 @@ def _webs(bodies: Mapping[str, Body], cut: Sequence[str], through: Mapping[str, 
 
 
 def _stray(
-    near: Mapping[str, Sequence[str]], network: Network, total: Array, place: Callable[..., str], rng: Rng
+    near: Mapping[str, Sequence[str]], network: Network, total: Array, place: Callable[..., str], dice: Dice
 ) -> dict[str, Link]:
     """Weak paths between bodies that have a neighbour in common."""
     out = {}
@@ -181,7 +203,9 @@ def _stray(
     for a, b in sorted(second):
         if b not in near[a]:
             least = min(float(sum(total[c, c] for c in network.bodies[n])) for n in (a, b))
-            out[f"stray_{a}_{b}"] = _link(place(a), place(b), least * rng.uniform(0.0, POLICY.stray_conductance))
+            key = f"stray_{a}_{b}"
+            share = dice.of(key).uniform(0.0, POLICY.stray_conductance)
+            out[key] = _link(place(key, a), place(key, b), least * share)
     return out
 
 
@@ -189,16 +213,18 @@ def _link(one: str, other: str, conductance_W_per_K: float) -> Link:
     return Link(between=(one, other), conductance=Value(value=f"{conductance_W_per_K:.6g} W/K"))
 
 
-def _seen(chain: ErrorChain, place: Callable[..., str]) -> ErrorChain:
+def _seen(key: str, chain: ErrorChain, place: Callable[..., str]) -> ErrorChain:
     """The error chain with its lengths and levers attached about the middle of the bodies."""
     span = POLICY.drawn_length_centre
-    links = tuple(c.model_copy(update={"body": place(c.body, *span)}) for c in chain.chain)
-    tilts = tuple(t.model_copy(update={"hot": place(t.hot, *span), "cold": place(t.cold, *span)}) for t in chain.tilts)
+    links = tuple(c.model_copy(update={"body": place(key, c.body, *span)}) for c in chain.chain)
+    tilts = tuple(
+        t.model_copy(update={"hot": place(key, t.hot, *span), "cold": place(key, t.cold, *span)}) for t in chain.tilts
+    )
     return chain.model_copy(update={"chain": links, "tilts": tilts})
 
 
 def _placed(
-    given: MechanismPart, place: Callable[..., str], near: Mapping[str, Sequence[str]], rng: Rng
+    key: str, given: MechanismPart, place: Callable[..., str], near: Mapping[str, Sequence[str]], dice: Dice
 ) -> MechanismPart:
     """The mechanism with its heat into a place of the body, a little of it into a neighbour; fitted shares keep their
     names."""
@@ -207,9 +233,9 @@ def _placed(
         return given
     rest = next(k for k, v in into.items() if v == "rest")
     neighbours = near.get(rest.partition("@")[0], ())
-    out: dict[str, Value | str] = {place(k) if v == "rest" else k: v for k, v in into.items()}
+    out: dict[str, Value | str] = {place(key, k) if v == "rest" else k: v for k, v in into.items()}
     if neighbours and isinstance(given.into, str) and MECHANISMS[given.law].takes_from is None:
-        out[place(neighbours[int(rng.integers(len(neighbours)))])] = Value(
-            value=float(f"{rng.uniform(0.0, POLICY.leak_share):.4g}")
-        )
+        rng = dice.of("leak", key)
+        neighbour, share = neighbours[int(rng.integers(len(neighbours)))], rng.uniform(0.0, POLICY.leak_share)
+        out[place(key, neighbour)] = Value(value=float(f"{share:.4g}"))
     return given.model_copy(update={"into": out})

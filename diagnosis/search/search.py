@@ -12,7 +12,7 @@ from data.errors import InputError, WorkError
 from data.processes import Processes
 from diagnosis.candidates.free_forms import Form, candidate_of, free_forms
 from diagnosis.contracts import Candidate, Fitted, Tried, with_parts
-from diagnosis.fitting.fitted import refitted, relearned
+from diagnosis.fitting.fitted import refitted, relearned, structured
 from diagnosis.localisation.balance import impossible
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, proposed, screen
@@ -107,16 +107,37 @@ def one_round(
 
 def decided(done: Round) -> Round:
     """A round with what its explanations gain, the likeliest first; what alone makes possible what the recordings show
-    before all."""
+    before all.
+
+    Structure that is drawn about a fit without an effect may imitate one, or be made of what an effect would explain.
+    So the likeliest is confirmed, and the next one if it loses its place by that, until none is worth it.
+    """
     if not done.tried:
         return done
     strange = frozenset(i.channel for i in impossible(done.before))
-    before = _fair(done.before, done.tried)
+    before, anew = _fair(done.before, done.tried), None
     tried = [_against(before, t) for t in done.tried]
-    tried.sort(key=lambda t: (not _resolves(t, strange), -t.standing))
-    return replace(
-        done, before=before, tried=tuple(tried), figures=figures(before, tried), resolved=_resolves(tried[0], strange)
-    )
+    while True:
+        tried.sort(key=lambda t: (not _resolves(t, strange), -t.standing))
+        first, found = tried[0], figures(before, tried)
+        resolved = _resolves(first, strange)
+        if first.confirmed or resolved or found.probability < POLICY.grown_min_probability:
+            return replace(done, before=before, tried=tuple(tried), figures=found, resolved=resolved)
+        anew = anew or _redrawn(before)
+        tried[0] = _confirmed(first, anew)
+
+
+def _redrawn(fitted: Fitted) -> Fitted:
+    """The fit under structure that is drawn anew about it; itself where none can be drawn."""
+    with suppress(WorkError):
+        return structured(fitted, fitted.runs)
+    return fitted
+
+
+def _confirmed(t: Tried, before: Fitted) -> Tried:
+    """An explanation with what it gains at least: also under structure that is drawn anew about both fits."""
+    again = _redrawn(t.fitted).log_evidence - before.log_evidence
+    return replace(t, gain=min(t.gain, again), confirmed=True)
 
 
 def _fair(now: Fitted, tried: Sequence[Tried]) -> Fitted:
@@ -124,13 +145,14 @@ def _fair(now: Fitted, tried: Sequence[Tried]) -> Fitted:
     its way, and would keep without its effect, is no gain of that effect."""
     best, first = relearned(now), max(tried, key=lambda t: t.standing)
     with suppress(InputError, WorkError):  # where it has gone with the effect, no machine without it is
-        back = relearned(refitted(first.fitted, now.part))
+        back = refitted(first.fitted, now.part)
         best = back if back.log_evidence > best.log_evidence else best
     return best
 
 
 def _against(before: Fitted, t: Tried) -> Tried:
-    return replace(t, gain=t.fitted.log_evidence - before.log_evidence, by_run=t.fitted.foretold - before.foretold)
+    gain, by_run = t.fitted.log_evidence - before.log_evidence, t.fitted.foretold - before.foretold
+    return replace(t, gain=gain, by_run=by_run, confirmed=False)
 
 
 def _forms(now: Fitted) -> dict[str, tuple[Candidate, Form]]:

@@ -8,11 +8,12 @@ from typing import Any, cast
 import pytest
 
 from diagnosis.candidates.library import candidates
-from diagnosis.candidates.priors import at_size, size_of, start_values
+from diagnosis.candidates.priors import at_size, free_values, size_of
 from diagnosis.contracts import Fitted, Scored
-from diagnosis.fitting.fitted import refitted
+from diagnosis.fitting.carried import carried_start
 from diagnosis.policy import POLICY
 from tests.diagnosis.small_cases import FLOOR, cold_floor, four_bodies
+from twin.calibration.least_squares import x_of
 from twin.compile import compile_network
 from twin.mechanisms import MECHANISMS
 from twin.quantity import Value, convert
@@ -67,15 +68,16 @@ def test_watts_conductances_and_surfaces_go_with_it_and_nothing_else() -> None:
 
 
 def test_a_structural_one_begins_at_what_the_screen_saw_about_the_usual_value() -> None:
-    values, _ = start_values(bridge(2.8), cold_floor())
+    values = free_values(bridge(2.8), cold_floor())
     own = values["conductance"]
     assert own.value is not None and own.prior is not None
     assert (convert(own.value, "W/K"), convert(own.prior, "W/K")) == (2.8, 5.0)
     floor = Value(value="3 W/K", prior="10 W/K", spread=1.5)
     part = cold_floor().part
     given = MechanismPart.model_validate({**FLOOR, "parameters": {"conductance": floor}})
-    begun = refitted(cold_floor(), part.model_copy(update={"mechanisms": {**part.mechanisms, "floor": given}}), steps=0)
+    more = part.model_copy(update={"mechanisms": {**part.mechanisms, "floor": given}})
+    problem, z, _ = carried_start(cold_floor(), more)
     name = "exposures.head-floor.conductance"
-    assert begun.values[begun.problem.network.index(name)] == pytest.approx(3.0)
-    (u,) = [u for u in begun.problem.unknowns if u.name == name]
+    assert problem.values_at(x_of(problem.unknowns, z))[problem.network.index(name)] == pytest.approx(3.0)
+    (u,) = [u for u in problem.unknowns if u.name == name]
     assert u.value(u.prior) == pytest.approx(10.0)

@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 from scipy.stats import multivariate_normal
 
 from data.arrays import Array
+from data.errors import WorkError
 from diagnosis.fitting.covariance import Covariance, alone_in, clipped
 from diagnosis.fitting.marginal import Grams, Hyper, Marginal
 from diagnosis.policy import POLICY
@@ -175,3 +176,11 @@ def test_no_draw_is_the_only_direction() -> None:
     drawn = [np.ones((5, 9)) * np.array([1.0] * 8 + [100.0])]
     size = np.linalg.norm(clipped(drawn)[0], axis=0)
     assert size[:8] == pytest.approx(np.sqrt(5.0)) and size[8] == pytest.approx(4.0 * np.sqrt(5.0))
+
+
+def test_derivatives_that_no_machine_has_are_said_to_be_so() -> None:
+    """A start that has run away: its derivatives are beyond what numbers of 53 bits can be inverted with."""
+    wild = [1e12 * np.column_stack([n[:, 0], n[:, 0]]) for n in problem()["own"]]
+    at = [np.zeros(n.shape[1]) for n in wild]
+    with pytest.raises(WorkError, match="cannot be linearised"):
+        Marginal(marginal().covariance, wild, at, 1).level(Hyper())

@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 
 from data.batch import Batch
-from data.errors import InputError
+from data.errors import InputError, WorkError
 from data.processes import Processes
 from diagnosis.candidates.discretisation import never_reported, slack
+from diagnosis.contracts import Fitted
 from diagnosis.fitting.fitted import left_out_rows, plain, worsened
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import proposed
@@ -133,6 +134,33 @@ def test_what_a_refit_would_keep_without_its_effect_is_no_gain() -> None:
     again = decided(replace(r, before=short))
     assert again.before.log_evidence > r.before.log_evidence - 1 and again.best is not None and r.best is not None
     assert again.best.gain == pytest.approx(r.best.gain, abs=2.0)
+
+
+def test_an_explanation_that_structure_drawn_anew_does_not_bear_out_is_not_claimed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    r = found("drift").rounds[0]
+    assert r.best is not None and r.best.confirmed and r.accepted
+
+    def anew(fitted: Fitted, runs: int) -> Fitted:
+        return r.before if fitted is r.best.fitted else fitted  # type: ignore[union-attr]
+
+    monkeypatch.setattr(search_module, "structured", anew)
+    again = decided(r)
+    assert again.best is not None and again.best.candidate != r.best.candidate
+    lost = next(t for t in again.tried if t.candidate == r.best.candidate)
+    assert lost.confirmed and lost.gain == pytest.approx(0.0, abs=1e-6)
+
+
+def test_where_no_twin_can_be_drawn_anew_a_claim_is_judged_by_its_own_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none(*_: Any) -> None:
+        raise WorkError("no refined twin could be simulated")
+
+    r = found("drift").rounds[0]
+    monkeypatch.setattr(search_module, "structured", none)
+    again = decided(r)
+    assert again.accepted and again.best is not None and r.best is not None
+    assert again.best.candidate == r.best.candidate and again.best.gain >= r.best.gain
 
 
 @pytest.mark.parametrize("sd", [1.9, 2.1])

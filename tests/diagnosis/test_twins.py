@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from diagnosis.fitting.twins import refined
-from tests.diagnosis.small_cases import four_bodies
+from diagnosis.fitting.twins import Dice, refined
+from tests.diagnosis.small_cases import DRIFT, four_bodies
 from twin.compile import compile_network
 from twin.schema import twin_part
 
@@ -15,7 +13,7 @@ def test_a_web_joins_two_different_cells_of_its_body_and_every_drawn_network_com
     part, network = twin_part(known), compile_network(four_bodies())
     webs = 0
     for seed in range(30):
-        drawn, cut = refined(part, network, network.values, np.random.default_rng(seed))
+        drawn, cut = refined(part, network, network.values, Dice(seed, 0))
         for key, link in drawn.links.items():
             if not key.startswith("web_"):
                 continue
@@ -27,3 +25,16 @@ def test_a_web_joins_two_different_cells_of_its_body_and_every_drawn_network_com
         finer = compile_network(known, part=drawn)
         assert finer.n_cells > network.n_cells
     assert webs > 100
+
+
+def test_machines_that_differ_by_an_effect_are_refined_alike_in_all_else() -> None:
+    known = [four_bodies(), four_bodies(mechanisms__drift=DRIFT)]
+    networks = [compile_network(m) for m in known]
+    (one, cut), (other, other_cut) = (
+        refined(twin_part(m), n, n.values, Dice(3, 7)) for m, n in zip(known, networks, strict=True)
+    )
+    assert cut == other_cut and one.bodies == other.bodies and one.links == other.links
+    assert one.sensors == other.sensors and one.errors == other.errors
+    assert one.mechanisms == {k: v for k, v in other.mechanisms.items() if k != "drift"}
+    next_one, _ = refined(twin_part(known[0]), networks[0], networks[0].values, Dice(3, 8))
+    assert next_one.links != one.links and next_one.bodies != one.bodies

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pytest
 
 from diagnosis.candidates.alternatives import alternatives
-from diagnosis.candidates.priors import start_values
-from diagnosis.contracts import Scored, with_value
-from tests.diagnosis.small_cases import consistent, equipped, four_bodies, two_bodies
+from diagnosis.contracts import with_value
+from tests.diagnosis.small_cases import equipped, four_bodies, two_bodies
 from twin.compile import compile_network
 from twin.quantity import Parameter
 from twin.schema import TwinPart, twin_part
@@ -98,15 +96,3 @@ def test_a_wrong_parameter_of_every_rival_can_be_freed() -> None:
             p = after.parameters[after.index(c.change.parameter.name)]
             assert p.value == c.change.parameter.value
             assert p.free and p.spread == c.change.spread
-
-
-@pytest.mark.parametrize("log_factor", [-8.0, 0.4, 8.0])
-def test_a_doubted_value_begins_where_its_fitting_coordinate_is_finite(log_factor: float) -> None:
-    """Also a share, such as a sensor's bonding, that a factor would take beyond 1."""
-    found = [c for c in alternatives(compile_network(four_bodies())) if c.change is not None and c.change.spread]
-    assert {c.change.parameter.scale for c in found if c.change is not None} == {"log", "logit"}
-    for c in found:
-        scored = Scored(c, amplitudes={"factor": log_factor})
-        _, begin = start_values(scored, consistent())
-        assert c.change is not None
-        assert np.isfinite(c.change.parameter.to_x(begin[c.change.parameter.name]))

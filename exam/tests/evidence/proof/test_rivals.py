@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from diagnosis.candidates.priors import start_values
+from diagnosis.candidates.priors import free_values
 from diagnosis.screening.signatures import difference
 from diagnosis.search.search import Search, search
 from tests.diagnosis.small_cases import cold_floor, consistent
@@ -83,7 +83,7 @@ def test_signatures_are_what_a_little_of_the_mechanism_changes() -> None:
     done = floor().rounds[0]
     rows = plain_rows(done)
     k, s = next((k, s) for k, s in enumerate(rows.scored) if s.candidate.mechanism == "cabinet_heat")
-    values, _ = start_values(replace(s, amplitudes={"heat": 1.0}), done.before)
+    values = free_values(replace(s, amplitudes={"heat": 1.0}), done.before)
     values = {"heat": values["heat"].model_copy(update={"value": "1 W"})}
     problem = done.before.problem
     base = problem.residuals(done.before.x, done.before.nuisance)

@@ -11,7 +11,7 @@ import pytest
 import thermodrift_exam.proof.scoring.true_model as module
 from data.errors import InputError
 from diagnosis.contracts import Scored
-from diagnosis.fitting.fitted import baseline, refitted
+from diagnosis.fitting.fitted import baseline
 from diagnosis.screening.screen import proposed, screen
 from evidence.scoring.answer_key import AnswerKey
 from tests.diagnosis.concealed import case, flux
@@ -146,21 +146,14 @@ def test_two_heats_of_one_mechanism_at_one_body_are_two_terms() -> None:
     assert [size for size, *_ in got.sizes] == [pytest.approx(60.0, rel=0.2), pytest.approx(90.0, rel=0.2)]
 
 
-def test_it_begins_with_less_where_all_of_it_cannot_be_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_simulated_is_neither_visible_nor_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stiff(*_: Any) -> None:
+        raise InputError("stiff beyond the step control")
+
     known = two_bodies()
     hidden = {"floor": {**FLOOR, "parameters": {"conductance": "8 W/K"}}}
-    begun: list[float] = []
-
-    def at_first_not(old: Any, part: Any, at: Any = None) -> Any:
-        begun.extend([max(at.values())] if at else [])
-        if len(begun) == 1:
-            raise InputError("stiff beyond the step control")
-        return refitted(old, part, at)
-
-    monkeypatch.setattr(module, "refitted", at_first_not)
-    got = true_model(known, runs(known, hidden), answer("one", floor(8.0)))
-    assert begun[1] == pytest.approx(0.3 * begun[0])
-    assert got.visible == (True,) and got.error_true == pytest.approx(cold(8.0).error_true, rel=0.05)
+    monkeypatch.setattr(module, "afresh", stiff)
+    assert true_model(known, runs(known, hidden), answer("one", floor(8.0))).visible == (None,)
 
 
 def _place(s: Scored) -> str:

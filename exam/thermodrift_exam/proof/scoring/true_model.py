@@ -19,12 +19,12 @@ from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
 from diagnosis.candidates.free_forms import BODY_PARAMETERS, Form, Level, candidate_of
-from diagnosis.candidates.priors import start_values
+from diagnosis.candidates.priors import free_values
 from diagnosis.contracts import Candidate, Fitted, Scored, Where
 from diagnosis.drafting.draft import drafted_part
 from diagnosis.findings.conclude import reported_parameters
 from diagnosis.fitting.batches import enough_batches, usable_batches
-from diagnosis.fitting.fitted import baseline, left_out_rows, refitted, relearned
+from diagnosis.fitting.fitted import afresh, baseline, left_out_rows, refitted
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, proposed, screen
 from evidence.scoring.answer_key import AnswerKey, Spot, TrueTerm
@@ -82,42 +82,31 @@ def each_its_own(terms: Sequence[TrueTerm], choices: Sequence[Sequence[Scored]])
     return out
 
 
-def begun_at_truth(
-    term: TrueTerm, s: Scored, now: Fitted, share: float = 1.0
-) -> tuple[Mapping[str, Value], Mapping[str, float]]:
-    """`start_values` of a refit that begins at the values of the key, amplitudes at this share of them; priors are
-    those of a diagnosis.
-    """
-    c = s.candidate
-    if c.mechanism not in MECHANISMS or c.change is not None:
-        return start_values(s, now)
-    mechanism = MECHANISMS[c.mechanism]
+def at_truth(term: TrueTerm, s: Scored, now: Fitted) -> Mapping[str, Value]:
+    """The values of a candidate where the key states them, under the priors of a diagnosis."""
+    if s.candidate.mechanism not in MECHANISMS:
+        return {}
+    mechanism = MECHANISMS[s.candidate.mechanism]
     known = {n: v for n, (v, _) in (term.parameters or {}).items() if n in {p.name for p in mechanism.parameters}}
     stated = {a: known[a] - off for a, off in (mechanism.off or {}).items() if a in known}
-    amplitudes = {a: share * v for a, v in {**s.amplitudes, **stated}.items()}
-    values, at = start_values(replace(s, amplitudes=amplitudes), now)
-    shaped = {
-        name: given.model_copy(update={"value": _said(known[name], mechanism.spec(name).unit), "prior": given.value})
-        for name, given in values.items()
-        if name in known and name not in (mechanism.off or {})
-    }
-    return {**values, **shaped}, at
+    values = free_values(replace(s, amplitudes={**s.amplitudes, **stated}), now)
+
+    def moved(name: str, given: Value) -> Value:
+        usual = given.value if given.prior is None else given.prior
+        return given.model_copy(update={"value": _said(known[name], mechanism.spec(name).unit), "prior": usual})
+
+    return {name: moved(name, given) if name in known else given for name, given in values.items()}
 
 
-def with_terms(
-    part: TwinPart, terms: Sequence[TrueTerm], found: Sequence[Scored], now: Fitted, share: float = 1.0
-) -> tuple[TwinPart, dict[str, float]]:
-    """The twin part with these candidates, and the start of a refit; `share` as in `begun_at_truth`.
+def with_terms(part: TwinPart, terms: Sequence[TrueTerm], found: Sequence[Scored], now: Fitted) -> TwinPart:
+    """The twin part with these candidates.
 
     Raises:
         ValueError: two of them take the same name.
     """
-    at: dict[str, float] = {}
     for term, s in zip(terms, found, strict=True):
-        values, begin = begun_at_truth(term, s, now, share)
-        part = s.candidate.applied(part, values)
-        at.update(begin)
-    return part, at
+        part = s.candidate.applied(part, at_truth(term, s, now))
+    return part
 
 
 def _driven_as(term: TrueTerm, c: Candidate) -> bool:
@@ -213,22 +202,12 @@ def best_candidates(
 
 
 def _with(fit: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None]) -> Fitted | None:
-    """The fit with the stated terms at its optimum, under the covariance that is likeliest for it: structure may have
-    stood in for them. None where it cannot be simulated.
-
-    As in a diagnosis, it begins with a smaller amplitude where the full one cannot be simulated: heat with positive
-    feedback diverges in a network with wrong values.
-    """
+    """The fit with the stated terms, fitted as a diagnosis fits an explanation. None where it cannot be simulated."""
     own = [(t, s) for t, s in zip(terms, found, strict=True) if s is not None]
-    for share in (1.0, *POLICY.start_amplitude_shares):
-        try:
-            part, at = with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit, share)
-            return relearned(refitted(fit, part, at))
-        except (InputError, WorkError):
-            continue
-        except ValueError:  # one candidate twice
-            return None
-    return None
+    try:
+        return afresh(fit, with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit))
+    except (InputError, WorkError, ValueError):  # ValueError: one candidate twice
+        return None
 
 
 def _judged(
@@ -239,9 +218,9 @@ def _judged(
     if full is None or s is None:
         return _Judged()
     own = [(t, o) for k, (t, o) in enumerate(zip(terms, found, strict=True)) if k != which and o is not None]
-    part: TwinPart = with_terms(fit.part, [t for t, _ in own], [o for _, o in own], fit)[0]
+    part = with_terms(fit.part, [t for t, _ in own], [o for _, o in own], fit)
     try:
-        without = [relearned(refitted(full, part)).log_evidence, *([] if own else [fit.log_evidence])]
+        without = [refitted(full, part).log_evidence, (afresh(fit, part) if own else fit).log_evidence]
     except (InputError, WorkError):
         return _Judged()
     gain = full.log_evidence - max(without)
