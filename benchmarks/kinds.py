@@ -10,8 +10,9 @@ alarms, cases of two effects with both named, unlisted effects flagged, and seco
 finding, or an explanation that these recordings cannot distinguish from it, has its mechanism and its place. Cases that
 are done are not done again; `--workers` side by side. `--paired` takes of every kind ten cases with one effect of at
 least `--noises` times its noise, seven with none and three with two, by seeds from the number given; `--table` stores a
-row for each, `--claims` one for each round, to which `POLICY.claim_weights` is fitted; what is visible is not judged
-for it. The proof (`thermodrift prove --plants …`) asks the same under seal, with baselines.
+row for each. `--claims` stores the likeliest claim of the first round of each instead, and prints the offset and weight
+of a claim's probability (`POLICY.claim_offset`) that are fitted to them. The proof (`thermodrift prove --plants …`)
+asks the same under seal, with baselines.
 """
 
 from __future__ import annotations
@@ -26,6 +27,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import roc_auc_score
+from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
 from threadpoolctl import threadpool_limits
 
 from benchmarks.results import write
@@ -36,12 +40,15 @@ from data.processes import Processes
 from diagnosis.contracts import Candidate
 from diagnosis.diagnose import diagnose
 from diagnosis.fitting.batches import usable_batches
+from diagnosis.fitting.fitted import baseline
 from diagnosis.result import Diagnosis
 from diagnosis.search.claims import Round, alike
+from diagnosis.search.search import one_round
 from evidence.scoring.answer_key import AnswerKey, Spot
 from evidence.scoring.matching import names_term
+from thermodrift_exam.plants.plant import Case
 from thermodrift_exam.proof.scoring.true_model import TrueModel, true_model
-from thermodrift_exam.proof.spec import KIND_PLANTS, Kind, PlantKind
+from thermodrift_exam.proof.spec import KIND_PLANTS, CaseSpec, Kind, PlantKind
 from thermodrift_exam.proof.suite.build import answer_of
 from thermodrift_exam.proof.suite.other_kinds import drawn_kind, executed_kind, kind_case
 from twin.compile import compile_network
@@ -50,34 +57,27 @@ from twin.schema import TwinPart, twin_part
 PAIRED: dict[Kind, int] = {"one": 10, "nothing": 7, "two": 3}  # cases of each kind
 SHARES: dict[Kind, float] = {"nothing": 0.4, "one": 0.45, "unlisted": 0.15}
 SHOWN = 10
+LEAST_GAIN = 1e-4  # relative: what gains less, or nothing, is alike
 
 
 def examined(
-    kind: PlantKind, seed: int, out: str, proposed: int = 0, paired: Kind | None = None, noises: float = 3.0,
-    truth: bool = True,
-) -> dict[str, Any]:  # fmt: skip
+    kind: PlantKind, seed: int, out: str, proposed: int = 0, paired: Kind | None = None, noises: float = 3.0
+) -> dict[str, Any]:
     """One case, from its file where it is done already; with so many proposed runs after the first answer.
 
     Args:
         paired: what the case conceals; by default it is drawn.
         noises: least size of the effect of a paired case, by the noise of the channel that it moves most.
-        truth: whether it is judged if the effects are visible at all.
     """
     path = Path(out) / f"{kind}_{seed}{f'_{paired}' if paired else ''}.json"
     if path.exists():
         return dict(json.loads(path.read_text()))
-    drawn = 1000 * (1 + KIND_PLANTS.index(kind)) + seed  # of its own: equal seeds give kinds equal effects and sizes
-    what = paired or np.random.default_rng(drawn).choice(list(SHARES), p=list(SHARES.values()))
-    while True:
-        spec = kind_case("case_0001", what, kind, drawn, "development")
-        case = drawn_kind(spec)
-        if paired is None or min((t["sigma"] for t in case.truth["terms"]), default=np.inf) >= noises:
-            break
-        drawn += 1
+    spec, case = _drawn(kind, seed, paired, noises)
     answer = answer_of(spec, case)
-    key = AnswerKey.from_json(answer)
+    key, what = AnswerKey.from_json(answer), spec.kind
     begun = time.process_time()
-    row: dict[str, Any] = {"kind": kind, "seed": drawn if paired else seed, "what": what, "terms": case.truth["terms"]}
+    row: dict[str, Any] = {"kind": kind, "seed": spec.seed if paired else seed, "what": what}
+    row["terms"] = case.truth["terms"]
     try:
         with threadpool_limits(limits=1):
             part = twin_part(case.machine)
@@ -86,12 +86,42 @@ def examined(
             row |= _answered(done, key, part)
             row["cpu_s"] = round(time.process_time() - begun, 1)
             row["proposed"] = list(_proposed(done, case.machine, batches, answer["redraw"], key, proposed))
-            if what in ("one", "two") and truth:
+            if what in ("one", "two"):
                 row |= _visible(
                     true_model(case.machine, batches, answer, done.search.baseline if done.search else None)
                 )
     except (InputError, WorkError) as error:
         row["trouble"] = str(error)
+    path.write_text(json.dumps(row, default=float))
+    return row
+
+
+def _drawn(kind: PlantKind, seed: int, paired: Kind | None, noises: float) -> tuple[CaseSpec, Case]:
+    """A case; of a paired one the first whose effects are large enough."""
+    drawn = 1000 * (1 + KIND_PLANTS.index(kind)) + seed  # of its own: equal seeds give kinds equal effects and sizes
+    what = paired or np.random.default_rng(drawn).choice(list(SHARES), p=list(SHARES.values()))
+    while True:
+        spec = kind_case("case_0001", what, kind, drawn, "development")
+        case = drawn_kind(spec)
+        if paired is None or min((t["sigma"] for t in case.truth["terms"]), default=np.inf) >= noises:
+            return spec, case
+        drawn += 1
+
+
+def first_round(kind: PlantKind, seed: int, out: str, _: int, paired: Kind, noises: float) -> dict[str, Any]:
+    """The first round of a paired case, as a row of `claims`; from its file where it is done already."""
+    path = Path(out) / f"{kind}_{seed}_{paired}_first.json"
+    if path.exists():
+        return dict(json.loads(path.read_text()))
+    spec, case = _drawn(kind, seed, paired, noises)
+    key, part = AnswerKey.from_json(answer_of(spec, case)), twin_part(case.machine)
+    bodies = {name: sensor.at.partition("@")[0] for name, sensor in part.sensors.items()}
+    begun = time.process_time()
+    with threadpool_limits(limits=1):
+        batches, _rest = usable_batches(compile_network(case.machine, part=part), case.batches)
+        done = one_round(baseline(case.machine, part, batches), Processes(), lambda step, n, of: None)
+    row = {"kind": kind, "seed": spec.seed, "what": paired, "terms": case.truth["terms"],
+           "rounds": [_round(done, key, bodies)], "cpu_s": round(time.process_time() - begun, 1)}  # fmt: skip
     path.write_text(json.dumps(row, default=float))
     return row
 
@@ -216,11 +246,11 @@ def _named(r: Mapping[str, Any]) -> int:
 
 
 def pairs(
-    kinds: Sequence[PlantKind], first: int, out: Path, noises: float, truth: bool
-) -> list[tuple[PlantKind, int, str, int, Kind, float, bool]]:
+    kinds: Sequence[PlantKind], first: int, out: Path, noises: float
+) -> list[tuple[PlantKind, int, str, int, Kind, float]]:
     """The cases of `--paired`, in turn over the kinds."""
     return [
-        (kind, first - 1000 + 100 * k, str(out), 0, what, noises, truth)
+        (kind, first - 1000 + 100 * k, str(out), 0, what, noises)
         for k in range(max(PAIRED.values())) for what, n in PAIRED.items() if k < n for kind in kinds
     ]  # fmt: skip
 
@@ -243,17 +273,33 @@ def as_rows(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def claims(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
-    """The likeliest claim of every round, accepted or not, with its figures, and whether it is right."""
+    """The likeliest claim of every first round, accepted or not, with its figures, and whether it is right."""
     found = [
         {
             "kind": r["kind"], "seed": r["seed"],
-            "concealed": "+".join(t["effect"] for t in r["terms"]) or "nothing", "round": k,
+            "concealed": "+".join(t["effect"] for t in r["terms"]) or "nothing",
             "claim": a["tried"][0]["name"], "gain_nats": round(a["tried"][0]["gain"], 1),
             **{name: round(value, 5) for name, value in a["figures"].items()}, "right": "yes" if a["right"] else "no",
         }
-        for r in rows for k, a in enumerate(r.get("rounds", ()), start=1) if a["figures"]
+        for r in rows for a in r["rounds"] if a["figures"]
     ]  # fmt: skip
-    return pd.DataFrame(found).sort_values(["kind", "seed", "concealed", "round"])
+    return pd.DataFrame(found).sort_values(["kind", "seed", "concealed"])
+
+
+def fitted_weights(table: pd.DataFrame) -> str:
+    """Offset and weight of the logarithm of the relative gain, and how well other kinds than a claim's foretell it."""
+    x = np.log(np.maximum(table["relative_gain"].to_numpy(), LEAST_GAIN))[:, None]
+    right, kind = (table["right"] == "yes").to_numpy(), table["kind"].to_numpy()
+    probability = cross_val_predict(
+        LogisticRegression(), x, right, groups=kind, cv=LeaveOneGroupOut(), method="predict_proba"
+    )[:, 1]
+    loss = -np.log(np.where(right, probability, 1.0 - probability))
+    fit = LogisticRegression().fit(x, right)
+    return (
+        f"claim_offset {fit.intercept_[0]:.2f}, claim_weight {fit.coef_[0, 0]:.2f} of {len(x)} claims, {right.sum()} "
+        f"of them right; kinds left out in turn: log loss {loss.mean():.3f} ± {loss.std() / np.sqrt(len(loss)):.3f}, "
+        f"area {roc_auc_score(right, probability):.2f}"
+    )
 
 
 def main() -> None:
@@ -262,7 +308,7 @@ def main() -> None:
     parser.add_argument("--paired", type=int, help="seed of the first pair")
     parser.add_argument("--table", type=Path, help="where a row for each case goes, .csv")
     parser.add_argument("--noises", type=float, default=3.0, help="least size of the effect of a paired case")
-    parser.add_argument("--claims", type=Path, help="where the claim of each round below --out goes, .csv")
+    parser.add_argument("--claims", type=Path, help="where the claim of each first round goes, .csv")
     parser.add_argument("--cases", type=int, default=12, help="of each kind")
     parser.add_argument("--first", type=int, default=0, help="seed of the first case")
     parser.add_argument("--workers", type=int, default=2)
@@ -272,13 +318,13 @@ def main() -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     tasks: list[tuple[Any, ...]] = []
     if given.paired is not None:
-        tasks += pairs(given.kinds or KIND_PLANTS, given.paired, given.out, given.noises, given.claims is None)
+        tasks += pairs(given.kinds or KIND_PLANTS, given.paired, given.out, given.noises)
     else:
         seeds, kinds = range(given.first, given.first + given.cases), given.kinds or ["lathe", "board"]
         tasks += [(kind, seed, str(given.out), given.proposed) for seed in seeds for kind in kinds]
     rows = []
     with Processes(given.workers) as pool:
-        for k, row in pool.completed(examined, tasks):
+        for k, row in pool.completed(first_round if given.claims else examined, tasks):
             rows.append(row)
             effect = "+".join(f"{t['effect']} {t.get('sigma', 0):.1f}" for t in row["terms"]) or row["what"]
             first = next(iter(row.get("listed", ())), {"name": row.get("trouble", "no claim")})
@@ -286,8 +332,10 @@ def main() -> None:
     if given.table:
         write(given.table, as_rows(rows), f"python -m benchmarks.kinds --paired {given.paired} --table {given.table}")
     if given.claims:
-        every = (json.loads(path.read_text()) for path in sorted(given.out.glob("*.json")))
-        write(given.claims, claims(every), f"python -m benchmarks.kinds --claims {given.claims}")
+        stored = claims(rows)
+        write(given.claims, stored, f"python -m benchmarks.kinds --paired {given.paired} --claims {given.claims}")
+        print(fitted_weights(stored))
+        return
     print("\n".join([*table(rows), *(after_proposed(rows, given.proposed) if given.proposed else ())]))
 
 
