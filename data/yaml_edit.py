@@ -100,7 +100,8 @@ class YamlText:
             raise ValueError(f"{'.'.join(path)}: expected a mapping, got {str(around)!r}")
         if comment:
             self._open(path)
-        node = _node(key, value, self._column([*path, key]), 0 if _is_flow(around) else blocks)
+        lines = entry_lines(key, value, self._column([*path, key]), 0 if _is_flow(around) else blocks)
+        node = YamlText(dedent("\n".join(lines)))._root[str(key)]
         if _is_flow(around):
             _make_flow(node)
         if key in around:
@@ -171,10 +172,6 @@ def entry_lines(key: str, value: Any, column: int, blocks: int = 0) -> list[str]
         f"{indent}{name}:",
         *(line for k, v in value.items() for line in entry_lines(k, v, column + 2, max(blocks - 1, 0))),
     ]
-
-
-def _node(key: str, value: Any, column: int, blocks: int) -> Any:
-    return YamlText(dedent("\n".join(entry_lines(key, value, column, blocks))))._root[str(key)]
 
 
 def _child(node: Any, step: str) -> Any:

@@ -61,7 +61,8 @@ def fleet_page(
         for f in fleets
     )
     simulated = bool(rows) and all(r["simulated"] for r in rows if r["n_seen"])
-    sections = [Section("alerts", "Alerts", (_alerts(alerts),))] if alerts else []
+    listed = Table("", _ALERTS, tuple(Row.of(*a) for a in alerts))
+    sections = [Section("alerts", "Alerts", (listed,))] if alerts else []
     table = Table("", _COLUMNS, tuple(_row(r, now, simulated, pages) for r in rows), notes=(_NOTE,), look="stacked")
     sections.append(Section("fleet", "Machines and channels, worst first", (table,), "Machines and channels"))
     if unknown:
@@ -70,6 +71,7 @@ def fleet_page(
     return Page("thermodrift status", f"Fleet: {summary}", top, tuple(sections), served, simulated, "Fleet")
 
 
+_ALERTS = (Column("machine"), Column("channel"), Column("alert", kind="wide"))
 _COLUMNS = (
     Column("machine, channel"), Column("champion"), Column("knows runs up to"), Column("error to expect, S"),
     Column("in newer runs, S"), Column("runs outside the trained region"), Column("failed sensors"),
@@ -81,11 +83,6 @@ _NOTE = (
     "the training. A run is outside where its inputs leave the region of the training runs by more than 5 % of its "
     "width."
 )
-
-
-def _alerts(alerts: Sequence[tuple[str, str, str]]) -> Table:
-    columns = (Column("machine"), Column("channel"), Column("alert", kind="wide"))
-    return Table("", columns, tuple(Row.of(*a) for a in alerts))
 
 
 def _row(r: Mapping[str, Any], now: datetime, simulated: bool, pages: Mapping[str, str]) -> Row:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -75,7 +74,8 @@ def tried(cells: pd.DataFrame, chosen: str, title: str, levels_um: Mapping[str, 
         ax.plot(own.loc[every, "S_mean_um"], [i] * int(every.sum()), "s", color=INK, ms=3.8)
         mine = own.loc[labels[own.index] == chosen, "S_mean_um"]
         ax.plot(mine, [i] * len(mine), "D", color=ORANGE, ms=5.5)
-        ax.text(1.04, i, _chosen_by(row), transform=ax.get_yaxis_transform(), fontsize=7, color=MUTED, va="center")
+        chosen_by = f"{selector_label(row['selector'])}, {row['n_tsp']}" if row["n_tsp"] else ""
+        ax.text(1.04, i, chosen_by, transform=ax.get_yaxis_transform(), fontsize=7, color=MUTED, va="center")
     for name, level in levels_um.items():
         ax.axvline(level, color=MUTED, lw=1.0, ls=LEVELS[name])
     values = [*cells["S_mean_um"], *levels_um.values()]
@@ -88,11 +88,6 @@ def tried(cells: pd.DataFrame, chosen: str, title: str, levels_um: Mapping[str, 
 
 
 LEVELS = {"no model": ":", "mean curve": "--"}
-
-
-def _chosen_by(cell: dict[Any, Any]) -> str:
-    """``mRMR, 4``: the selector and the number of its points."""
-    return f"{selector_label(cell['selector'])}, {cell['n_tsp']}" if cell["n_tsp"] else ""
 
 
 def in_order(runs: pd.DataFrame, bound_um: float, title: str, simulated: bool) -> Figure:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from data.arrays import Array
 from data.errors import InputError
-from twin.simulation.schedule import Block, Ints, Pieces
+from twin.simulation.schedule import Block, Pieces
 
 _ASYMMETRY = 1e-9  # of the largest conductance; above it the matrix is no heat exchange between nodes
 _SERIES = [float(1.0 / np.prod(np.arange(1.0, k + 3.0))) for k in range(19)]  # 1/(k + 2)!, enough for x <= 1
@@ -249,7 +249,9 @@ def _starts(modes: Modes, pieces: Pieces, ends: Array, start_degC: Array, n_sets
     flat = starts.reshape(n_ranks, n_batches, -1)
     starts[0] = first[..., 0].swapaxes(0, 1)
     flat[1:] = ends.take(chain.by_rank[:-1], axis=0)
-    into = _basis_changes(modes, chain.pairs)
+    # (pairs, P, N, N): row amplitudes of the old regime times this are those of the new one
+    changes = modes.inverse[:, chain.pairs[:, 1]] @ modes.shape[:, chain.pairs[:, 0]]
+    into = np.ascontiguousarray(changes.transpose(1, 0, 3, 2))
     step = np.empty(flat.shape[1:])
     for k in range(1, n_ranks):
         np.multiply(flat[k - 1], decay[k - 1], out=step)
@@ -262,9 +264,3 @@ def _starts(modes: Modes, pieces: Pieces, ends: Array, start_degC: Array, n_sets
             new = old @ into[pair, 0] if len(modes.shape) == 1 else (old[:, :, None] @ into[pair])[:, :, 0]
             starts[k][batches] = new
     return flat.reshape(-1, n_sets * n_modes)
-
-
-def _basis_changes(modes: Modes, pairs: Ints) -> Array:
-    """(pairs, P, N, N): row amplitudes of the old regime times this are those of the new one."""
-    change = modes.inverse[:, pairs[:, 1]] @ modes.shape[:, pairs[:, 0]]
-    return np.ascontiguousarray(change.transpose(1, 0, 3, 2))
