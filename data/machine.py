@@ -215,9 +215,8 @@ class Recording(Form):
     @classmethod
     def _grid_of_rows(cls, given: Any) -> Any:
         """Without a clock and a grid of their own, the rows are the grid."""
-        time = given.get("time") if isinstance(given, dict) else None
         with contextlib.suppress(ValueError, KeyError, TypeError):  # the keys' own checks report it
-            step_s = seconds(time["step"])
+            step_s = seconds(given["time"]["step"])
             return {"step_s": step_s, "max_gap_s": 5 * step_s, **given}
         return given
 

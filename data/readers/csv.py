@@ -55,11 +55,12 @@ def find_encoding(raw: bytes, where: str) -> str:
         even, odd = raw[0::2].count(0), raw[1::2].count(0)
         if min(even, odd) * 10 < max(even, odd) and max(even, odd) * 4 > len(raw) // 2:
             return "utf-16-le" if odd > even else "utf-16-be"
-        line = raw.count(b"\n", 0, raw.index(b"\0")) + 1
-        raise _not_text(where, f": {raw.count(bytes(1))} NUL bytes from line {line} on, as a crash leaves them")
     control = sum(raw.count(bytes([c])) for c in (*range(1, 9), 11, *range(14, 26), 28, 29, 30, 31))
     if control * 100 > len(raw):
-        raise _not_text(where)
+        raise InputError(f"{where}: not a text file (binary content); expected CSV text; export the recording again")
+    if (first := raw.find(b"\0")) >= 0:
+        at = f"{raw.count(bytes(1))} NUL bytes from line {raw.count(10, 0, first) + 1} on, as a crash leaves them"
+        raise InputError(f"{where}: {at}; expected CSV text; remove them or export the recording again")
     if _decodes(raw, "utf-8"):
         return "utf-8"
     foreign = b"\n".join(line for line in raw.splitlines() if not line.isascii())
@@ -67,10 +68,6 @@ def find_encoding(raw: bytes, where: str) -> str:
         return "cp1252"  # a few letters are too little to tell
     best = from_bytes(foreign[:10_000], cp_isolation=_OTHER_ENCODINGS).best()
     return best.encoding if best is not None else "cp1252"
-
-
-def _not_text(where: str, what: str = "") -> InputError:
-    return InputError(f"{where}: not a text file (binary content){what}; expected CSV text; export the recording again")
 
 
 def _decodes(raw: bytes, encoding: str) -> bool:

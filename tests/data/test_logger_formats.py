@@ -370,7 +370,7 @@ def test_a_slow_channel_among_fast_rows_has_no_holes(tmp_path: Path) -> None:
     ("body", "cause"),
     [(b"", "holds no row below its first line"), (b"0,20,1\n", "holds one row of numbers"),
      (b"0,NaN,NaN\n60,NaN,NaN\n120,NaN,NaN\n", r"no column of numbers next to the clock: T1 \(empty or NaN\), z_um "),
-     (b"0,20,1\n60,21,2\n120,22,3\n\0\0\0", r"not a text file \(binary content\): 3 NUL bytes from line 5")],
+     (b"0,20,1\n60,21,2\n120,22,3\n\0\0\0", "3 NUL bytes from line 5 on, as a crash leaves them")],
 )  # fmt: skip
 def test_each_unusable_file_has_its_cause(tmp_path: Path, body: bytes, cause: str) -> None:
     path = tmp_path / "a.csv"
