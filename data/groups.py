@@ -161,10 +161,10 @@ class Group:
             if asked:
                 self.notes.append(f"{', '.join(asked)}: taken for drivers; set role: error if one is measured")
         elif len(open_) == 1:
-            unit = units[open_[0]]
-            self.notes.append(f"{open_[0]} ({unit or 'no unit'}) is taken for the measured error; else set its role")
-            by = f"unit {unit}" if unit else "name"
-            roles[open_[0]] = Guess("error", f"the only channel that can be it, by its {by}")
+            (name,) = open_
+            self.notes.append(f"{name} ({units[name] or 'no unit'}) is taken for the measured error; else set its role")
+            by = f"unit {units[name]}" if units[name] else "name"
+            roles[name] = Guess("error", f"the only channel that can be it, by its {by}")
         else:
             shown = open_ or [n for n, r in roles.items() if r.value == "driver"] or [*roles]
             self.notes.append(
