@@ -166,7 +166,9 @@ class TransferFunction(Family):
                  "exponents": np.array([s.exponent for s in sources])}  # fmt: skip
         # For `sd_um`: left-out residuals with the poles where the candidate has them.
         grows = mean_square(self.started(design).x, design)
-        spread = np.transpose(left_out_spread(task, grows, path, chosen)).tolist()
+        used, at = np.unique(chosen, return_inverse=True)
+        path = partial(ridge_path, penalties=PENALTIES[used])
+        spread = np.transpose(left_out_spread(task, grows, path, at)).tolist()
         names = ("variance_um2", "variance_growth_um2")
         return [
             self._learned(design, {**plain, "direct_um": direct_um[f], "gain_um": gain_um[f],
@@ -388,11 +390,13 @@ def _second_pole(c: Candidate) -> list[Candidate]:
 
 @dataclass(frozen=True)
 class _Solved:
-    """Gains at given poles: weight and slope of `combination`, ridge alpha (F,), gain (F, p), sum of squares (F,)."""
+    """Gains at given poles: weight and slope of `combination`, the pool's xx times the weight, ridge alpha (F,), gain
+    (F, p), sum of squares (F,)."""
 
     log_tau: Array
     weight: Array
     slope: Array
+    xx_weight: Array
     alpha: Array
     gain: Array
     sse: Array
@@ -400,14 +404,14 @@ class _Solved:
     @classmethod
     def at(cls, log_tau: Array, pool: Pool, yy: Array, direct: NDArray[np.bool_], penalty: Array) -> Self:
         weight, slope = combination(log_tau, direct)
-        across = weight.transpose(0, 2, 1)
-        matrix, right = across @ pool.xx @ weight, (across @ pool.xy[:, :, None])[:, :, 0]
+        across, xx_weight = weight.transpose(0, 2, 1), pool.xx @ weight
+        matrix, right = across @ xx_weight, (across @ pool.xy[:, :, None])[:, :, 0]
         alpha = penalty * mean_diagonal(matrix)
         ridge = alpha[:, None, None] * np.eye(matrix.shape[1])
         gain = np.asarray(np.linalg.solve(matrix + ridge, right[:, :, None])[:, :, 0], float)
         square = np.einsum("fj,fj->f", gain, (matrix @ gain[:, :, None])[:, :, 0])
         sse = np.maximum(yy - 2.0 * np.einsum("fj,fj->f", gain, right) + square, 0.0)
-        return cls(log_tau, weight, slope, alpha, gain, sse)
+        return cls(log_tau, weight, slope, xx_weight, alpha, gain, sse)
 
     def cost(self, shared: Array, hold: Array) -> Array:
         away = ((self.log_tau - shared[:, None, :]) ** 2).sum(axis=(1, 2))
@@ -417,13 +421,13 @@ class _Solved:
         """The Gauss–Newton step in log τ, (F, S, L), gains moving along."""
         n_fits, n_sources, n_poles = self.log_tau.shape
         p, n_lags = self.gain.shape[1], n_sources * n_poles
-        columns = np.concatenate([self.weight, self.slope * self.gain[:, None, p - n_lags :]], axis=2)
-        across = columns.transpose(0, 2, 1)
-        rest = pool.xy - (pool.xx @ self.weight @ self.gain[:, :, None])[:, :, 0]
+        moved = self.slope * self.gain[:, None, p - n_lags :]
+        across = np.concatenate([self.weight, moved], axis=2).transpose(0, 2, 1)
+        rest = pool.xy - (self.xx_weight @ self.gain[:, :, None])[:, :, 0]
         right = (across @ rest[:, :, None])[:, :, 0]
         away = (self.log_tau - shared[:, None, :]).transpose(0, 2, 1).reshape(n_fits, -1)
         right -= np.concatenate([self.alpha[:, None] * self.gain, hold[:, None] * away], axis=1)
-        matrix = across @ pool.xx @ columns
+        matrix = across @ np.concatenate([self.xx_weight, pool.xx @ moved], axis=2)
         ridge = [np.repeat(self.alpha[:, None], p, axis=1), np.repeat(hold[:, None], n_lags, axis=1)]
         np.einsum("fjj->fj", matrix)[:] += np.concatenate(ridge, axis=1)
         step = np.linalg.solve(matrix, right[:, :, None])[:, p:, 0]
