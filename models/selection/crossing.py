@@ -205,6 +205,7 @@ class FamilyResult:
     cells: pd.DataFrame
     predictions: dict[str, NDArray[np.float32]]  # "protocol|selector|family|n_tsp" -> by fold and tested batch
     failures: list[tuple[str, str]]
+    cpu_s: float = 0.0  # of the process that computed it
 
     @classmethod
     def joined(cls, parts: Sequence[FamilyResult]) -> FamilyResult:
@@ -212,7 +213,8 @@ class FamilyResult:
         tables = [[getattr(p, name) for p in parts if len(getattr(p, name))] for name in ("scores", "cells")]
         scores, cells = (pd.concat(own, ignore_index=True) if own else pd.DataFrame() for own in tables)
         predictions = {name: values for p in parts for name, values in p.predictions.items()}
-        return cls(scores, cells, predictions, list(dict.fromkeys(f for p in parts for f in p.failures)))
+        failures = list(dict.fromkeys(f for p in parts for f in p.failures))
+        return cls(scores, cells, predictions, failures, sum(p.cpu_s for p in parts))
 
 
 def with_target(batches: Sequence[Batch], target: str) -> list[Batch]:

@@ -22,9 +22,10 @@ error.
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,7 +39,8 @@ from models.selection.crossing import Cell, Crossing, FamilyResult, Inputs, cros
 from models.selection.loss import BASELINES, cost_of_choosing, paired, pooled
 from models.selection.stack import best_cells, stacked
 
-ROUND_COLUMNS = ["round", "selector", "family", "n_tsp", "n_runs", "S_mean_um", "behind_um", "se_um", "kept", "why"]
+ROUND_COLUMNS = ["round", "selector", "family", "n_tsp", "n_runs", "S_mean_um", "behind_um", "se_um", "kept", "why",
+                 "cpu_s"]  # fmt: skip
 _CLEARLY = 0.99  # one-sided level of the paired test: the leader is the best of many, and so flattered
 _JUDGED_SHARE, _JUDGED_RUNS = 0.25, 4  # judged in the first rounds; of fewer to learn from rich models look worse
 _FIRST_POINTS = ("correlation", 4)  # next to all points: least squares on all of many sensors is no fair trial
@@ -74,8 +76,10 @@ class Job:
 
     def run(self, crossing: Crossing) -> FamilyResult:
         """Score them."""
+        begun_s = time.process_time()
         crossing.chosen.update(self.chosen)
-        return cross_family(crossing, self.family, self.cells, self.folds, self.keep)
+        found = cross_family(crossing, self.family, self.cells, self.folds, self.keep)
+        return replace(found, cpu_s=time.process_time() - begun_s)
 
 
 class Raced(NamedTuple):
@@ -93,7 +97,7 @@ def rounds(crossing: Crossing) -> Rounds:
     """Yields the jobs of every round and takes their results; returns the result and a table of who was dropped when.
 
     The table has the columns `ROUND_COLUMNS`: S_mean_um over the n_runs of that round, how far behind the leader with
-    the standard error of that difference, and why a cell is not kept.
+    the standard error of that difference, why a cell is not kept, and the CPU time of its family in that round, in s.
     """
     every = {key: tuple(crossing.cells(FAMILIES[key])) for key in crossing.plan.families}
     every = {key: cells for key, cells in every.items() if cells}
@@ -289,5 +293,9 @@ def _kept(
     own = pd.DataFrame(names, columns=keys).assign(
         round=name, n_runs=S_um.shape[1], S_mean_um=S_mean_um, behind_um=behind_um, se_um=se_um, kept=kept, why=why
     )
+    spent = Counter[str]()
+    for r in results:
+        spent.update(dict.fromkeys(r.scores["family"].astype(str).unique()[:1] if len(r.scores) else (), r.cpu_s))
+    own = own.assign(cpu_s=own["family"].map(spent).astype(float).round(4))
     table.append(own.iloc[order][ROUND_COLUMNS])
     return [names[i] for i in range(len(names)) if kept[i]]

@@ -111,6 +111,8 @@ def print_details(outcome: TrainOutcome) -> None:
         console.line(in_error_unit(text, outcome.units[target]))
     for target, result in outcome.results.items():
         _print_leaderboard(f"{outcome.machine} {target}{label}", result.cells, outcome.units[target])
+    for target, result in outcome.results.items():
+        _print_race(f"{outcome.machine} {target}{label}", result.race, outcome.units[target])
     for target, training in outcome.training_ids.items():
         promotion = outcome.promotions.get(target)
         said = promotion.summary if promotion else f"training {target} {training}"
@@ -140,6 +142,23 @@ def _print_leaderboard(title: str, cells: pd.DataFrame, unit: str) -> None:
         own = rows[(rows[keys] == [row[k] for k in keys]).all(axis=1)].set_index("protocol")
         scores = [_score(own, p) for p in protocols]
         table.add_row(row["family"], row["selector"], str(own["n_inputs"].iloc[0]), *scores)
+    console.out.print(table)
+
+
+def _print_race(title: str, race: pd.DataFrame, unit: str) -> None:
+    """What each family cost in the race, and what its best cell of its last round would have had to gain."""
+    if race.empty:
+        return
+    cpu_s = race.drop_duplicates(["round", "family"]).groupby("family")["cpu_s"].sum()
+    last = race.drop_duplicates("family", keep="last").set_index("family")["round"]
+    own = race[race["round"] == race["family"].map(last)]
+    best = own.sort_values("S_mean_um", kind="stable").drop_duplicates("family").set_index("family")
+    names = ("family", "last round")
+    table = console.table(f"{title}, race", *names, "CPU s", f"behind, {unit_label(unit) or 1}", left=names)
+    for family, spent_s in cpu_s.sort_values(ascending=False).items():
+        row = best.loc[str(family)]
+        behind = f"{row['behind_um']:.2f}±{row['se_um']:.2f}" if row["behind_um"] > 0 else "leads"
+        table.add_row(str(family), str(row["round"]), f"{spent_s:.2f}", behind)
     console.out.print(table)
 
 

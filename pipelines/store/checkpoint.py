@@ -92,6 +92,7 @@ def _write(result: FamilyResult, held: Path) -> None:
             result.cells.to_parquet(scratch / "cells.parquet", index=False)
             np.savez(scratch / "predictions.npz", allow_pickle=False, **result.predictions)
             (scratch / "failures.json").write_text(json.dumps(result.failures, ensure_ascii=False), encoding="utf-8")
+            (scratch / "cpu_s.json").write_text(json.dumps(result.cpu_s), encoding="utf-8")
             (scratch / _SUMS).write_text(json.dumps(_sums(scratch)), encoding="utf-8")
     except OSError:
         if not held.is_dir():  # else another process was quicker
@@ -106,7 +107,8 @@ def _read(held: Path) -> FamilyResult:
         predictions = {name: stored[name] for name in stored.files}
     failures = [(a, b) for a, b in from_json((held / "failures.json").read_text(encoding="utf-8"))]
     scores, cells = (pd.read_parquet(held / f"{name}.parquet") for name in ("scores", "cells"))
-    return FamilyResult(scores, cells, predictions, failures)
+    cpu_s = float(from_json((held / "cpu_s.json").read_text(encoding="utf-8")))
+    return FamilyResult(scores, cells, predictions, failures, cpu_s)
 
 
 def _sums(folder: Path) -> dict[str, str]:

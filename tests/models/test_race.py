@@ -40,6 +40,11 @@ def test_only_the_finalists_are_scored_by_all_folds_and_the_others_say_why_not(r
     assert not set(result.cells["protocol"]) & {"train-on-one", "forward-gap"}
 
 
+def test_the_race_says_what_every_family_cost_in_every_round(raced) -> None:
+    race = raced[1].race
+    assert (race["cpu_s"] > 0).all() and (race.groupby(["round", "family"])["cpu_s"].nunique() == 1).all()
+
+
 def test_the_race_finds_what_the_whole_crossing_finds(raced, toy_batches) -> None:
     complete = run_grid(toy_batches(12), ["z"], Plan(families=FAMILIES, effort="complete"))["z"][1]
     rule = PromotionRule()

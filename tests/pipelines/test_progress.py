@@ -91,6 +91,22 @@ def test_a_line_steers_no_terminal_and_says_what_it_was_given(capsys: pytest.Cap
     assert capsys.readouterr().out == "root:x:0 \\x1b[2J\\u202egnp.exe [bold]\n"
 
 
+def test_a_family_has_its_cost_and_what_it_would_have_had_to_gain(monkeypatch: pytest.MonkeyPatch) -> None:
+    from pipelines.commands.train import _print_race
+
+    out = io.StringIO()
+    monkeypatch.setattr(console, "out", Console(file=out, width=80, soft_wrap=True))
+    rows = [("families", "svr", 2.0, 0.9, 0.2, 0.5), ("families", "ridge", 1.5, 0.4, 0.1, 0.25),
+            ("runs", "ridge", 1.6, 0.6, 0.3, 1.0), ("runs", "ridge", 1.4, 0.4, 0.2, 1.0),
+            ("families", "mlr", 1.1, 0.0, 0.0, 0.1), ("runs", "mlr", 1.0, 0.0, 0.0, 0.2)]  # fmt: skip
+    names = ["round", "family", "S_mean_um", "behind_um", "se_um", "cpu_s"]
+    _print_race("m z", pd.DataFrame(rows, columns=names), "um")
+    found = {line.split()[0]: line.split()[1:] for line in out.getvalue().splitlines()[3:] if line.strip()}
+    assert list(found) == ["ridge", "svr", "mlr"], "the dearest first"
+    assert found["ridge"] == ["runs", "1.25", "0.40±0.20"] and found["svr"] == ["families", "0.50", "0.90±0.20"]
+    assert found["mlr"] == ["runs", "0.30", "leads"]
+
+
 def test_the_main_table_shows_whole_names_in_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
     from pipelines.commands.train import _print_leaderboard
 
