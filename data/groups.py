@@ -312,16 +312,16 @@ def joint(main: Group, other: Group) -> Joint | None:
         return Joint({"sheet": other.sheets[0]}, "the sheet has other columns of the same run") if same else None
     folder = Path(os.path.relpath(other.paths[0].resolve().parent, main.paths[0].resolve().parent))
     single = {"file": (folder / other.paths[0].name).as_posix()}
+    here, there = _runs(main.paths, other.paths), _runs(other.paths, main.paths)
+    if here and there and here[1] == there[1] and (other.table.time is not None or main.table.time is None):
+        files = {"file": (folder / there[0]).as_posix()}
+        return Joint(files, "the names of the files differ by the same text", here[0])
     if other.table.time is None:
         steps = np.diff(main.longest.time_s)
         if len(main.paths) > 1 or len(other.paths) > 1 or len(main.longest) != len(other.longest) or np.ptp(steps) > 0:
             return None
         other.row_step_s = float(steps[0]) * main.clock.unit_s
         return Joint(single, "given together with the recording, with as many rows", main.paths[0].name)
-    here, there = _runs(main.paths, other.paths), _runs(other.paths, main.paths)
-    if here and there and here[1] == there[1]:
-        files = {"file": (folder / there[0]).as_posix()}
-        return Joint(files, "the names of the files differ by the same text", here[0])
     if len(other.paths) == 1:
         if len(main.paths) == 1 and (main.sheets == other.sheets or len(main.sheets) == len(other.sheets) == 1):
             return Joint(single, "given together with the recording", main.paths[0].name)

@@ -344,13 +344,15 @@ def test_a_clock_that_jumps_back_by_an_hour_stays_the_clock(tmp_path: Path, name
     assert (batch.start, batch.time_s[-1]) == (START, 180 * (N - 1))
 
 
-def test_the_step_of_recordings_without_a_clock_is_asked_once(tmp_path: Path) -> None:
-    """It is that of the joined file and of the grid."""
-    for name, table in (("t.xlsx", {"T1": FRONT, "T2": BED}), ("z.xlsx", {"z_um": Z})):
-        pd.DataFrame(table).to_excel(tmp_path / name, index=False)
-    text = drafted([tmp_path / "t.xlsx", tmp_path / "z.xlsx"])[0]
+@pytest.mark.parametrize("runs", [[""], ["_01", "_02", "_03"]])
+def test_the_step_of_recordings_without_a_clock_is_asked_once(tmp_path: Path, runs: Sequence[str]) -> None:
+    """It is that of the joined files and of the grid."""
+    for run in runs:
+        pd.DataFrame({"T1": FRONT, "T2": BED}).to_excel(tmp_path / f"t{run}.xlsx", index=False)
+        pd.DataFrame({"z_um": Z}).to_excel(tmp_path / f"z{run}.xlsx", index=False)
+    text = drafted(sorted(tmp_path.glob("*.xlsx")))[0]
     assert text.count("fill in") == 1 == text.count("step:") and "step_s" not in text
-    batch = read(tmp_path / "t.xlsx", text.replace("? s", "20 s"))
+    batch = read(tmp_path / f"t{runs[-1]}.xlsx", text.replace("? s", "20 s"))
     assert batch.step_s == 20 and np.array_equal(batch.values("z_um"), Z) and np.array_equal(batch.values("T1"), FRONT)
 
 
