@@ -1,9 +1,11 @@
 """A fleet on a Prefect server: one deployment per machine, whose runs the server schedules and this process begins.
 
 Prefect's own `serve` ends where its server is away for some minutes. Its process worker (3.8) does not, but like
-`serve` it then works off every run that was scheduled meanwhile, one after another. Here a server that does not answer
-is one line, and its return another; of the runs that came due meanwhile the newest of each machine is done, the others
-are cancelled with the reason.
+`serve` it then works off every run that was scheduled meanwhile, one after another. With one run at a time for each
+deployment (`concurrency_limit` 1, `CANCEL_NEW`) the server is to cancel the others, but the engine ends a run that
+cannot renew its place, as it does every 225 s: 8 to 11 s after connections were refused. Here a server that does not
+answer is one line, its return another, and no run depends on it; of the runs that came due meanwhile the newest of each
+machine is done, the others are cancelled with the reason.
 """
 
 from __future__ import annotations
