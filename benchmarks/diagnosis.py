@@ -97,9 +97,8 @@ def steps_of(p: Posed, repeats: int, which: tuple[str, ...] = STEPS) -> Iterator
     took, seen = timed(lambda: screen(fitted, p.every), repeats)
     yield "screen", took
     if "refined twins" in which:
-        rng = np.random.default_rng(0)
         drawn = partial(drawn_misfits, fitted.machine, fitted.part, fitted.batches, problem, fitted.values)
-        yield "refined twins", timed(lambda: drawn(POLICY.refined_twins, rng), 1)[0]
+        yield "refined twins", timed(lambda: drawn(POLICY.refined_twins, 0), 1)[0]
     yield "refit", statistics.median(timed(partial(refit, fitted, s), 1)[0] for s in chosen(fitted, seen))
     if "locate" in which:
         yield "locate", timed(lambda: locate(problem, fitted.x, fitted.own, fitted.batches), 1)[0]
