@@ -101,7 +101,7 @@ class Work:
         log = self.out / "undisturbed.log"
         sys.stdout.flush()
         if not (pid := os.fork()):
-            _become(self.home, log, [module, *map(str, arguments)])
+            become(self.home, log, [module, *map(str, arguments)])
         end_s = time.monotonic() + WAIT_S
         while not (ended := os.waitpid(pid, os.WNOHANG))[0]:
             if time.monotonic() > end_s:
@@ -117,10 +117,14 @@ class Work:
             raise RuntimeError(f"undisturbed {arguments}: exit code {code}\n{output}")
 
 
-def _become(home: Path, log: Path, argv: list[str]) -> NoReturn:
-    """Turn a forked process into a command, which ends it."""
+def become(home: Path, log: Path, argv: list[str], stdin: int | None = None) -> NoReturn:
+    """Turn a forked process into a command, which ends it; it reads `stdin` and has no other file of its parent."""
     os.setsid()
     os.chdir(ROOT)
+    if stdin is not None:
+        os.dup2(stdin, 0)
+        os.closerange(3, 1024)
+        sys.stdin = os.fdopen(0, encoding="utf-8", closefd=False)
     handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     os.dup2(handle, 1)
     os.dup2(handle, 2)

@@ -1,7 +1,7 @@
 """Fuzzing of everything that reads what others write: ``python -m tests.fuzz [--seconds 60] [--seed 0] [TARGET …]``.
 
-Valid input is damaged at random and given to the readers of recordings, the machine file, the samples of the
-compensation and its loop. Only the documented error may come out, in one line and within `SLOW_S`. A failure is printed
+Valid input is damaged at random and given to the readers of recordings, the machine file and the samples of the
+compensation. Only the documented error may come out, in one line and within `SLOW_S`. A failure is printed
 once for each place where it was raised, with the seed that repeats it; its input is written to the folder ``--keep``.
 """
 
@@ -10,9 +10,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
-import itertools
 import json
-import math
 import random
 import re
 import sys
@@ -23,16 +21,12 @@ import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import openpyxl
 import pandas as pd
 
 from compensation.connectors.messages import Names, Reports, sample_from_json
 from compensation.connectors.streams import LineParser
-from compensation.contracts import Sample
-from compensation.runtime import Compensator
-from compensation.serving import StateFile, _Line
 from data.errors import InputError
 from data.machine import Form, parse_machine
 from data.readers.csv import CsvSheet
@@ -241,63 +235,11 @@ class Lines:
             parser.sample(line, row)
 
 
-class Streams:
-    """The loop of the compensation over some lives of its process, each but the last killed between two samples: no
-    exception, and what is sent is finite and limited in size and rate, also from one life to the next."""
-
-    allowed: tuple[type[Exception], ...] = ()
-
-    def __init__(self) -> None:
-        from tests.compensation import test_runtime as toy
-
-        self._toy = toy
-        self._rows = toy.samples(toy.TRAIN[-1])
-
-    def make(self, dice: random.Random) -> bytes:
-        """JSON lines, each a life: a list of [s since the sample before, shift of its stamp in s, values, readings]."""
-        lives, odd = [], (math.nan, math.inf, -math.inf, 1e308, -40.0, 999.0, "n.a.", None, True, [1])
-        rows, usual = itertools.cycle(self._rows), dice.choice((1.0, 30.0, 300.0))
-        for _ in range(dice.randrange(1, 5)):
-            life = []
-            for _ in range(dice.choice((1, 5, 20, 60))):
-                values: dict[str, Any] = dict(next(rows).values)
-                for name in dice.sample(sorted(values), dice.choice((0, 0, 0, 1, 2))):
-                    values[name] = dice.choice(odd)
-                if dice.random() < 0.1:
-                    del values[dice.choice(sorted(values))]
-                readings = (
-                    {dice.choice(("z", "q")): dice.choice((*odd[:4], 3.0, -60.0))} if dice.random() < 0.05 else {}
-                )
-                wait_s = usual if dice.random() < 0.9 else dice.choice((0.0, 1e-3, 900.0, 1e5))
-                shift_s = 0.0 if dice.random() < 0.9 else dice.uniform(-2000.0, 20000.0)
-                life.append([wait_s, shift_s, None if dice.random() < 0.1 else values, readings])
-            lives.append(life)
-        return "\n".join(map(json.dumps, lives)).encode()
-
-    def run(self, given: bytes) -> None:
-        limits, at_s, was_um = self._toy.MODEL.limits, 1e9, 0.0
-        with tempfile.TemporaryDirectory() as folder:
-            for life in map(json.loads, given.splitlines()):
-                machine, clock_s = Compensator("toy", [self._toy.MODEL], self._toy.SUBSTITUTES, 300.0), 0.0
-                line = _Line(machine, [], StateFile(Path(folder) / "state"), lambda text: None, lambda c: None)
-                line.restore()
-                for wait_s, shift_s, values, readings in life:
-                    clock_s, at_s = clock_s + wait_s, at_s + wait_s
-                    sample = None if values is None else Sample(at_s + shift_s, values, readings)
-                    sent_um = line.answer(sample, clock_s).offset_um["z"]
-                    line.save(clock_s, 30.0)
-                    most_um = min(limits.rate_um_per_s * min(wait_s, limits.stale_s), limits.step_um)
-                    if not abs(sent_um) <= limits.max_offset_um or abs(sent_um - was_um) > most_um + 1e-9:
-                        raise AssertionError(f"sent {was_um:g}, then {sent_um:g} um after {wait_s:g} s")
-                    was_um = sent_um
-
-
-TARGETS: dict[str, type[Recordings] | type[MachineFiles] | type[Messages] | type[Lines] | type[Streams]] = {
+TARGETS: dict[str, type[Recordings] | type[MachineFiles] | type[Messages] | type[Lines]] = {
     "recordings": Recordings,
     "machine": MachineFiles,
     "messages": Messages,
     "lines": Lines,
-    "streams": Streams,
 }
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_exports_receiver import C, Sender, blocks, needs_gcc
+from test_exports_receiver import Sender, blocks, needs_gcc
 from test_runtime import INPUTS, model_of
 
 from compensation.exports.base import Export, ExportedAxis
@@ -20,7 +20,7 @@ from compensation.substitutes import Guard, Substitutes
 from data.batch import Batch
 from models.program import replay
 from tests.conftest import make_toy_batches
-from tests.toys.exported import export_of
+from tests.toys.exported import C, export_of
 
 LIMITS = Limits(max_offset_um=40.0, rate_um_per_s=0.5, step_um=2.0, hold_s=900.0, stale_s=900.0, warm_up_s=20.0)
 FAULTS = ("none", "frozen", "a step of 5 K", "out of range", "a spike")

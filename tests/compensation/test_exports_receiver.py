@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import re
 import shutil
-import subprocess
 from collections.abc import Sequence
 from dataclasses import replace
 from math import inf, isfinite, nan
@@ -26,10 +25,9 @@ from features.rises import feature
 from models.program import Builder, replay
 from models.selection.conformal import RunBound
 from tests.conftest import make_toy_batches
-from tests.toys.exported import export_of, offset_only, straight
+from tests.toys.exported import C, export_of, offset_only, straight
 
 LIMITS = Limits(max_offset_um=40.0, rate_um_per_s=0.5, step_um=2.0, hold_s=60.0, stale_s=900.0, warm_up_s=20.0)
-FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2", "-fsanitize=undefined", "-fno-sanitize-recover")
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc to compile the C export")
 
 
@@ -61,22 +59,6 @@ class Sender:
 
     def state(self, k: int) -> int:
         return int(self.carried[k][0][0])
-
-
-class C:
-    """The compiled source of an export."""
-
-    def __init__(self, export: Export, key: str, folder: Path) -> None:
-        (source,) = (p for p in EXPORTS[key]().write(export, folder) if p.suffix == ".c")
-        library = folder / f"{key}.so"
-        command = ["gcc", *FLAGS, "-shared", "-fPIC", "-o", str(library), str(source), "-lm"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        self.library, self.stem, self.n = ctypes.CDLL(str(library)), export.stem, len(export.axes)
-
-    def call(self, name: str, *args: object) -> int:
-        made = [a.ctypes.data_as(ctypes.c_void_p) if isinstance(a, np.ndarray) else a for a in args]
-        return int(getattr(self.library, f"{self.stem}_{name}")(*made))
 
 
 def blocks(export: Export, key: str) -> list[Block]:

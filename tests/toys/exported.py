@@ -1,18 +1,26 @@
-"""Models of several forms to be exported."""
+"""Models of several forms to be exported, and the C of an export, compiled."""
 
 from __future__ import annotations
 
+import _ctypes
+import ctypes
+import shutil
+import subprocess
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from compensation.exports import EXPORTS
 from compensation.exports.base import Export, ExportedAxis
 from compensation.safety import Limits
 from data.batch import Channel
 from models.program import Builder
 
 DIGEST = "0123456789abcdef" * 4
+FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2", "-fsanitize=undefined", "-fno-sanitize-recover")
 LIMITS = Limits(max_offset_um=40.0, rate_um_per_s=0.02, step_um=6.0, hold_s=900.0, stale_s=900.0, warm_up_s=0.0)
 
 
@@ -44,3 +52,31 @@ def lagged() -> ExportedAxis:
 
 def export_of(*axes: ExportedAxis, machine: str = "mill 1", simulated: bool = True) -> Export:
     return Export(machine, "champion@production", "v7", DIGEST, "2026-01-02T03:04:05Z", simulated, axes)
+
+
+class C:
+    """The compiled source of an export."""
+
+    def __init__(self, export: Export, key: str, folder: Path) -> None:
+        (source,) = (p for p in EXPORTS[key]().write(export, folder) if p.suffix == ".c")
+        library = folder / f"{key}.so"
+        command = ["gcc", *FLAGS, "-shared", "-fPIC", "-o", str(library), str(source), "-lm"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        self.library, self.stem, self.n = ctypes.CDLL(str(library)), export.stem, len(export.axes)
+
+    def call(self, name: str, *args: object) -> int:
+        made = [a.ctypes.data_as(ctypes.c_void_p) if isinstance(a, np.ndarray) else a for a in args]
+        return int(getattr(self.library, f"{self.stem}_{name}")(*made))
+
+    def copy(self, folder: Path) -> C:
+        """The same program with a memory of its own; one library is loaded once."""
+        other = copy(self)
+        other.library = ctypes.CDLL(shutil.copy(self.library._name, folder))
+        return other
+
+    def restart(self) -> None:
+        """The control is switched off and on: what is static is as at first."""
+        path = self.library._name
+        _ctypes.dlclose(self.library._handle)
+        self.library = ctypes.CDLL(path)
