@@ -26,6 +26,7 @@ from itertools import combinations
 from typing import Any, Literal, NamedTuple, Self, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compensation.contracts import check_limits
 from data.arrays import Array, Index, Mask
@@ -398,17 +399,16 @@ class Guard:
         if dt_s > limits.substitute_s:
             watch, dt_s = self.begin(watch.levels), 0.0
         x = np.array([_number(values.get(name)) for name in s.names])
-        status: list[Status] = list(watch.status)
+        status = np.array(watch.status, object)
         present = np.isfinite(x) & (x >= s.low) & (x <= s.high)
         before = watch.filled
         fresh = present & np.isnan(before)
-        for i in np.flatnonzero(~present & ~watch.bad):
-            status[i] = "lost" if np.isnan(x[i]) else "implausible"
+        status[~present & ~watch.bad] = "implausible"
+        status[np.isnan(x) & ~watch.bad] = "lost"
         usual_K = s.usual_K(dt_s)
         good = present & ~watch.bad & ~fresh
         good, (weights, sd_K, _) = self._without_steps(good, np.where(good, x - before, 0.0), usual_K)
-        for i in np.flatnonzero(present & ~watch.bad & ~fresh & ~good):
-            status[i] = "stepping"
+        status[present & ~watch.bad & ~fresh & ~good] = "stepping"
         predicted_K = weights @ np.where(good, x - before, 0.0)
 
         same = good & (np.abs(x - watch.same) <= _SAME_K)
@@ -416,43 +416,32 @@ class Guard:
         moved_K = np.where(same, watch.moved_K + predicted_K, 0.0)
         frozen = same & (same_s > HELD_MARGIN * np.maximum(s.held_s, s.step_s))
         frozen &= np.abs(moved_K) > limits.frozen_sd * sd_K + s.resolution_K
-        for i in np.flatnonzero(frozen):
-            status[i] = "frozen"
-        for i in np.flatnonzero(fresh):
-            status[i] = "ok"
-        was_off = np.array([a == "off" for a in status])
+        status[frozen] = "frozen"
+        status[fresh] = "ok"
+        was_off = status == "off"
         compared = (good & ~frozen) | fresh | (was_off & present)
         agree, level, level_sd_K = self._without_off(compared, x, watch)
-        for i in np.flatnonzero(compared & ~agree):
-            status[i] = "off"
-        off = np.array([a == "off" for a in status])
+        status[compared & ~agree] = "off"
+        off = status == "off"
         filled = np.where(off, level, np.where(frozen, watch.same + moved_K, before + predicted_K))
         begun = np.isnan(filled) & ~present & self._whole
         filled = np.where(begun, level, filled)
         filled = np.where(agree & ~was_off, x, np.clip(filled, s.low, s.high))
 
-        failed = np.array([a != "ok" for a in status])
+        failed = status != "ok"
         many = failed.mean() > limits.bad_share
         near = np.where(off, agree, np.abs(x - filled) <= limits.back_sd * sd_K + s.resolution_K)
         back, agreed = self._recovered(watch, status, x, present, near, usual_K, bool(many))
-        for i in np.flatnonzero(back):
-            status[i] = "ok"
+        status[back] = "ok"
         filled = np.where(back, x, filled)
         bad = failed & ~back
         used_s = np.where(bad, watch.used_s + dt_s, np.maximum(watch.used_s - dt_s, 0.0))
         kept = same | (bad & ~np.isnan(watch.same))  # a failed channel keeps the value at which it failed
         after = replace(
-            watch,
-            status=tuple(status),
-            filled=filled,
-            raw=np.where(present, x, np.nan),
-            used_s=used_s,
-            agreed=agreed,
-            same=np.where(kept, watch.same, filled),
-            same_s=same_s,
-            moved_K=moved_K,
+            watch, status=tuple(status), filled=filled, raw=np.where(present, x, np.nan), used_s=used_s, agreed=agreed,
+            same=np.where(kept, watch.same, filled), same_s=same_s, moved_K=moved_K,
             time_s=float(time_s) if np.isfinite(time_s) else watch.time_s,
-        )
+        )  # fmt: skip
         return after, self._checked(after, values, np.where(off | begun, level_sd_K, sd_K))
 
     def _without_steps(self, good: Mask, change_K: Array, usual_K: Array) -> tuple[Mask, Regression]:
@@ -509,14 +498,7 @@ class Guard:
         return self._known[key]
 
     def _recovered(
-        self,
-        watch: Watch,
-        status: list[Status],
-        x: Array,
-        present: Mask,
-        near: Mask,
-        usual_K: Array,
-        many: bool,
+        self, watch: Watch, status: NDArray[np.object_], x: Array, present: Mask, near: Mask, usual_K: Array, many: bool
     ) -> tuple[Mask, Array]:
         """Which failed channels are taken again (n,), and the number of consistent samples of each (n,).
 
@@ -526,11 +508,10 @@ class Guard:
         present = watch.bad & present
         steady = present & (np.abs(x - watch.raw) <= usual_K)
         spent = self._spent(watch)
-        gone = np.array([a in ("lost", "implausible") for a in status])
-        stuck = np.array([a == "frozen" for a in status]) & (np.abs(x - watch.same) <= _SAME_K)
+        gone = (status == "lost") | (status == "implausible")
+        stuck = (status == "frozen") & (np.abs(x - watch.same) <= _SAME_K)
         trusted = ~spent & (not many)
-        for i in np.flatnonzero(steady & ~near & trusted & gone):
-            status[i] = "stepping"
+        status[steady & ~near & trusted & gone] = "stepping"
         first = present & np.isnan(watch.raw)  # nothing before it to judge its rate by
         consistent = (steady | first) & ~stuck & (near | (~trusted & gone))
         agreed = np.where(consistent, watch.agreed + 1, 0)
