@@ -202,6 +202,8 @@ def save_model(model: Family, batches: Sequence[Batch], machine_file: Path | str
 def load_model(uri: Path | str) -> StoredModel:
     """The model behind ``models:/NAME@champion``, ``models:/NAME/3``, ``runs:/RUN/model`` or a local folder.
 
+    ``models:/NAME`` is its champion, without one its provisional version, see `StoredModel.standing`.
+
     Raises:
         InputError: unknown name, alias, version, run or folder, with the closest.
         WorkError: the tracking store does not answer.
@@ -281,13 +283,13 @@ def rehearse(
     return done
 
 
-def export(models: Paths, to: str, out: Path | str | None = None, *, provisional: bool = False) -> list[Path]:
+def export(models: Paths, to: str, out: Path | str | None = None, *, provisional: bool = True) -> list[Path]:
     """Write models for a control or another program: receiver, c, st, onnx, json or sinumerik.
 
     Args:
         models: what `load_model` takes, one for each axis of one machine.
         out: folder of the files; None: below the home.
-        provisional: accept models that are better than none, but not shown beyond doubt.
+        provisional: accept models that are better than none, but not shown beyond doubt; the files say so.
 
     Raises:
         InputError: an unknown form, a family that it cannot express, with those that can, or a model that may not act.

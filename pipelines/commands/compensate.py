@@ -15,7 +15,10 @@ from pipelines.options import Json
 if TYPE_CHECKING:
     from compensation.rehearsal import Rehearsal
 
+_ONE_EACH = "models:/NAME or a folder, one for each axis"
 Models = Annotated[list[str], typer.Argument(help="models:/NAME@champion or a folder, one for each axis")]
+OrModels = Annotated[list[str] | None, typer.Argument(help=_ONE_EACH)]
+Named = Annotated[list[str] | None, typer.Option("--model", help=_ONE_EACH)]
 MaxOffset = Annotated[
     float | None, typer.Option("--max-um", help="largest offset sent, µm; default: the training's largest error + 25 %")
 ]
@@ -80,6 +83,13 @@ def compensate(
         raise typer.Exit(128 + ended)
 
 
+def _named(command: str, models: list[str] | None, model: list[str] | None) -> list[str]:
+    """The models, as arguments or by --model. Raises: InputError, none."""
+    if not (named := [*(models or ()), *(model or ())]):
+        raise InputError(f"{command}: got no model; give --model {_ONE_EACH}")
+    return named
+
+
 def rehearsal_dict(r: Rehearsal) -> dict[str, Any]:
     """The rehearsal's figures for other programs."""
     axes = {}
@@ -93,10 +103,8 @@ def rehearsal_dict(r: Rehearsal) -> dict[str, Any]:
 
 def rehearse(
     recordings: Annotated[list[Path], typer.Option(help="file or folder; batches that the model has not seen")],
-    models: Annotated[
-        list[str] | None, typer.Argument(help="models:/NAME@champion or a folder, one for each axis")
-    ] = None,
-    model: Annotated[list[str] | None, typer.Option("--model", help="the same, as `predict` takes it")] = None,
+    models: OrModels = None,
+    model: Named = None,
     fail: Annotated[
         list[str] | None, typer.Option(help="SENSOR:HOW@START+DURATION, HOW lost, frozen or stepping")
     ] = None,
@@ -129,9 +137,7 @@ def rehearse(
 
     configure_environment()
     settings = load()
-    named = [*(models or ()), *(model or ())]
-    if not named:
-        raise InputError("rehearse: got no model; give --model models:/NAME@champion or a folder, one for each axis")
+    named = _named("rehearse", models, model)
     stored = [load_model(m, settings) for m in named]
     machine = stored[0].machine
     check_recordings(recordings)
@@ -162,8 +168,9 @@ def rehearse(
 
 
 def export(
-    models: Models,
     to: Annotated[str, typer.Option("--to", help="receiver, c, st, onnx, json or sinumerik")],
+    models: OrModels = None,
+    model: Named = None,
     out: Annotated[Path | None, typer.Option("--out", help="folder; default: var/export/MACHINE")] = None,
     max_um: MaxOffset = None,
     rate_um_per_s: Rate = 0.1,
@@ -172,7 +179,9 @@ def export(
         float | None,
         typer.Option(help="time without a usable row that is a fault, s; default: three steps, at least 30"),
     ] = None,
-    provisional: Provisional = False,
+    provisional: Annotated[
+        bool, typer.Option("--provisional/--no-provisional", help="take a model that is not shown beyond doubt")
+    ] = True,
     as_json: Json = False,
 ) -> None:
     """Write the receiver for a control, or a model as C, structured text, ONNX or JSON, with limits and fallback."""
@@ -182,7 +191,7 @@ def export(
 
     configure_environment()
     settings = load()
-    folders = {m: model_folder(m, settings) for m in models}
+    folders = {m: model_folder(m, settings) for m in _named("export", models, model)}
     given, paths = write_export(folders, to, out, Given(max_um, rate_um_per_s, stale_s=stale_s), period_s, provisional)
     remarks = [f"{a.axis}: {a.remark}" for a in given.axes if a.remark]
     if as_json:

@@ -26,7 +26,7 @@ _NAMED = 3  # flagged runs in the summary line
 def load_model(model_uri: str, settings: Settings) -> StoredModel:
     """The model behind ``models:/NAME@champion``, ``models:/NAME/3``, ``runs:/RUN/model`` or a local folder.
 
-    A name alone means its champion. A local folder needs no MLflow.
+    A name alone means its champion, without one its provisional version. A local folder needs no MLflow.
 
     Raises:
         InputError: unknown name, alias, version, run or folder, with the closest.
@@ -172,7 +172,7 @@ def as_cell(name: str) -> str:
 
 def predict(
     file: Annotated[Path, typer.Argument(help="a raw recording of the model's machine")],
-    model: Annotated[str, typer.Option("--model", help="models:/NAME@champion, models:/NAME/3, runs:/… or a folder")],
+    model: Annotated[str, typer.Option("--model", help="models:/NAME, models:/NAME/3, runs:/… or a folder")],
     to: Annotated[Path | None, typer.Option("--out", help=".csv or .parquet; default: CSV on standard output")] = None,
 ) -> None:
     """Predict the error of a recording, with the error to expect; runs unlike the training are flagged."""

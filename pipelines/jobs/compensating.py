@@ -184,7 +184,7 @@ def write_export(
     out: Path | None = None,
     given: Given | None = None,
     period_s: float = PERIOD_S,
-    provisional: bool = False,
+    provisional: bool = True,
 ) -> tuple[Export, list[Path]]:
     """Writes the models of one machine, folders by the names they are given, in one of the forms of `EXPORTS`.
 

@@ -16,6 +16,7 @@ from urllib.parse import unquote, urlsplit
 
 from data.errors import InputError, closest
 from data.files import from_json, write_atomic
+from pipelines.store.audit import CHAMPION, PROVISIONAL
 
 if TYPE_CHECKING:
     from pipelines.settings import Settings
@@ -44,7 +45,7 @@ class Registry:
     places: Mapping[str, Place] = field(default_factory=dict)
 
     def place(self, name: str, which: str) -> Place | None:
-        """Where a version's files are, by number or alias; None where that is not known.
+        """Where a version's files are, by number or alias (empty: `which_of`); None where that is not known.
 
         Raises:
             InputError: unknown name, with the closest.
@@ -53,6 +54,7 @@ class Registry:
             return None
         if name not in self.aliases:
             raise unknown_model(name, self.aliases)
+        which = which_of(self.aliases[name], which)
         return self.places.get(f"{name}/{self.aliases[name].get(which, which)}")
 
 
@@ -82,6 +84,11 @@ def keep(known: Registry, aliases: Mapping[str, Mapping[str, str]], found: Mappi
     }  # fmt: skip
     with suppress(OSError):  # a home that cannot be written is looked up anew each time
         write_atomic(home / _FILE, json.dumps(content, ensure_ascii=False))
+
+
+def which_of(aliases: Mapping[str, object], which: str) -> str:
+    """The alias or version that is meant; a name alone (empty) means the champion, without one the provisional."""
+    return which or (PROVISIONAL if PROVISIONAL in aliases and CHAMPION not in aliases else CHAMPION)
 
 
 def unknown_model(name: str, names: Iterable[str]) -> InputError:

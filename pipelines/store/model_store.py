@@ -155,15 +155,15 @@ class StoredModel:
 
 
 def registered(uri: str) -> tuple[str, str] | None:
-    """Name, and alias or version, of ``models:/NAME@alias``; a name alone means its champion. None: another form."""
+    """Name, and alias or version (empty: see `lookups.which_of`), of ``models:/NAME@alias``. None: another form."""
     match = _REGISTERED.match(uri)
-    return None if match is None else (match["name"], match["alias"] or match["version"] or CHAMPION)
+    return None if match is None else (match["name"], match["alias"] or match["version"] or "")
 
 
 def is_champion(uri: str) -> bool:
-    """Whether the champion of a registry is meant, as such."""
+    """Whether the champion of a registry is meant, as such; a name alone never leads to another refused model."""
     named = registered(uri)
-    return named is not None and named[1] == CHAMPION
+    return named is not None and named[1] in (CHAMPION, "")
 
 
 def save(

@@ -416,12 +416,13 @@ def find_model(client: MlflowClient, name: str) -> RegisteredModel:
 
 
 def find_version(client: MlflowClient, name: str, which: str) -> ModelVersion:
-    """A version by number or alias.
+    """A version by number or alias; empty: `lookups.which_of`.
 
     Raises:
         InputError: unknown name, version or alias, with the closest and the allowed ones.
     """
     model = find_model(client, name)
+    which = lookups.which_of(model.aliases, which)
     if which in model.aliases:
         return client.get_model_version_by_alias(name, which)
     versions = {str(v.version): v for v in model_versions(client, name)}

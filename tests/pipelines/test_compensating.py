@@ -370,10 +370,10 @@ def test_an_export_of_a_provisional_model_has_its_share_and_says_so(
     model: Path, provisional: Path, tmp_path: Path, kind: str
 ) -> None:
     with pytest.raises(InputError, match=r"is provisional: .* add --provisional to accept"):
-        write_export({"m": provisional}, kind, tmp_path)
+        write_export({"m": provisional}, kind, tmp_path, provisional=False)
     whole, _ = write_export({"m": model}, kind, tmp_path)
     assert all(a.checks is not None for a in whole.axes)
-    export, files = write_export({"m": provisional}, kind, tmp_path, provisional=True)
+    export, files = write_export({"m": provisional}, kind, tmp_path)
     assert all(REMARK.encode() in path.read_bytes() for path in files)
     rows = 20.0 + np.cumsum(np.ones((9, len(export.axes[0].program.channels))), axis=0)
     full, share = (replay(e.axes[0].program, rows) for e in (whole, export))

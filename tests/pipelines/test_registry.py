@@ -298,6 +298,32 @@ def test_a_provisional_version_stands_in_until_there_is_a_champion(store):
     assert aliases(store, name) == {"champion": 4, "challenger": 5}
 
 
+def test_a_name_alone_is_the_provisional_version_until_there_is_a_champion(store, tmp_path, monkeypatch, call):
+    monkeypatch.setenv("THERMODRIFT_HOME", str(store.home))
+    monkeypatch.chdir(tmp_path)
+    train(store, "toy-name", [5.0] * 7, **PROVISIONAL)
+    Path("in").mkdir()
+    toy_batches("toy-name", 2)[1].table.to_csv("in/run.csv", index=False)
+    commands = [["predict", "in/run.csv", "--out", "out.csv"], ["rehearse", "--recordings", "in", "--sample-s", "60"],
+                ["export", "--to", "json", "--out", "export"]]  # fmt: skip
+    for command in commands:
+        done = call(*command, "--model", "models:/toy-name-z")
+        named = [line for line in (done.out + done.err).splitlines() if "provisional model" in line]
+        assert done.code == 0 and len(named) == 1, done
+        done = call(*command, "--model", "models:/toy-name-z@champion")
+        assert (done.code, done.out) == (2, "")
+        lacking = r"better than no model, not shown beyond doubt; 0\.6 of the .*, not shown to be better than zero"
+        assert re.search(rf"has no champion: {lacking}; name a version \(1\).*; version 1 is provisional", done.err)
+    assert call("export", "models:/toy-name-z", "--to", "json", "--out", "again").code == 0
+    done = call("compensate", "models:/toy-name-z", "--from", "in/run.csv", "--replay")
+    assert done.code == 2 and "is provisional: better than no model in most" in done.err
+    done = call("export", "--to", "json")
+    assert (done.code, "export: got no model; give --model models:/NAME" in done.err) == (2, True)
+    train(store, "toy-name", [4.0] * 8)
+    assert "provisional" not in call("predict", "in/run.csv", "--out", "out.csv", "--model", "models:/toy-name-z").err
+    assert load_model("models:/toy-name-z", store).standing == "champion"
+
+
 def test_a_training_that_refuses_every_model_ends_the_provisional_one(store):
     refused = {"standing": "refused", "caution": "not shown to be better than zero"}
     assert train(store, "toy-ends", [5.0] * 6, **PROVISIONAL).outcome == "provisional"
