@@ -60,7 +60,8 @@ def fleet_page(
         f"{f['source']}: {count(f['machines'], 'machine')}, {'served now' if f['served'] else 'not served now'}."
         for f in fleets
     )
-    simulated = bool(rows) and all(r["simulated"] for r in rows if r["n_seen"])
+    recorded = [r["simulated"] for r in rows if r["unknown"] != "nothing ingested"]
+    simulated = bool(recorded) and all(recorded)
     listed = Table("", _ALERTS, tuple(Row.of(*a) for a in alerts))
     sections = [Section("alerts", "Alerts", (listed,))] if alerts else []
     table = Table("", _COLUMNS, tuple(_row(r, now, simulated, pages) for r in rows), notes=(_NOTE,), look="stacked")
@@ -87,10 +88,14 @@ _NOTE = (
 
 def _row(r: Mapping[str, Any], now: datetime, simulated: bool, pages: Mapping[str, str]) -> Row:
     """A machine's channel: alert, none (no champion, at best provisional) or ok."""
-    has = r["version"] is not None
-    state = "alert" if r["alerts"] else "ok" if has else "none"
-    lacking = "none" if r["provisional"] is None else f"v{r['provisional']} provisional"
-    badge = "ok" if has else "no champion" if r["provisional"] is None else "provisional"
+    stands_in, champion = r["provisional"] is not None, r["version"] is not None
+    has = champion or stands_in
+    state = "alert" if r["alerts"] else "ok" if champion else "none"
+    stands = Cell(f"v{r['version']} {r['family']}", _days(r["age_days"]))
+    if not champion:
+        lacking = f"v{r['provisional']} provisional" if stands_in else "none"
+        stands = Cell(lacking, "; ".join(filter(None, (r["family"], r["reason"]))))
+    badge = "ok" if champion else "provisional" if stands_in else "no champion"
     label = count(len(r["alerts"]), "alert") if r["alerts"] else badge
     newer, bound = r["newer_S_mean_um"], r["bound90_S_um"]
     drifted = newer is not None and bound is not None and newer > bound
@@ -98,7 +103,7 @@ def _row(r: Mapping[str, Any], now: datetime, simulated: bool, pages: Mapping[st
     return Row.of(
         Cell(f"{r['machine']} {r['channel']}", chip=(label, state), simulated=r["simulated"] and not simulated,
              link=pages.get(r["machine"], "")),
-        Cell(f"v{r['version']} {r['family']}", _days(r["age_days"])) if has else Cell(lacking, r["reason"]),
+        stands,
         Cell(seen[:10] or ("not known" if has else ""), _days(r["seen_days_ago"]) if seen else "",
              "old_champion" in r["rules"]),
         Cell(*_expected(r)),
@@ -115,7 +120,7 @@ def _row(r: Mapping[str, Any], now: datetime, simulated: bool, pages: Mapping[st
 
 def _expected(r: Mapping[str, Any]) -> tuple[str, str]:
     if r["expected_S_um"] is None:
-        return ("not known", "") if r["version"] is not None else ("", "")
+        return ("not known", "") if r["version"] or r["provisional"] else ("", "")
     bound = f"90 % below {r['bound90_S_um']:.3g}" if r["bound90_S_um"] is not None else ""
     return f"{r['expected_S_um']:.3g} µm", bound
 

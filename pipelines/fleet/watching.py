@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from pipelines.settings import Settings
     from pipelines.store.model_store import StoredModel
 
-SCHEMA = "thermodrift.status/3"
+SCHEMA = "thermodrift.status/4"
 KEPT_RUNS = 20  # of each channel, the newest
 KEPT_TRAININGS = 100  # the newest
 _STATUS = "status.json"
@@ -43,7 +43,8 @@ _NAMED = re.compile(r"\{env:([^{}]+)\}")
 
 @dataclass(frozen=True)
 class Champion:
-    """A champion as the registry has it; `version` None: the model has none, then `provisional` may stand in for it."""
+    """A champion as the registry has it; `version` None: the model has none, then `provisional` may stand in for it,
+    whose `source` and `tags` these are."""
 
     name: str
     target: str
@@ -132,9 +133,10 @@ def _champions(settings: Settings) -> dict[str, list[Champion]]:
             if not log.machine or not log.target:
                 continue
             version, since, source, tags = log.champion, "", "", dict[str, str]()
-            if version is not None:
-                v = client.get_model_version(model.name, str(version))
+            if (stands := version or log.provisional) is not None:
+                v = client.get_model_version(model.name, str(stands))
                 source, tags = str(v.source), dict(v.tags)
+            if version is not None:
                 reigns = [r for r in log.reigns if r.until is None]
                 since = reigns[-1].since.isoformat(timespec="seconds") if reigns else tags.get("trained_at", "")
             champion = Champion(model.name, log.target, version, since, source, tags, log.provisional)
@@ -169,7 +171,7 @@ def _gathered(
     trouble: dict[str, str] = {}
     for c in champions:
         try:
-            if c.version is not None:
+            if c.source:
                 folder = registry.version_folder(c, settings)
                 models[c.target] = model_store.load(folder)
         except (InputError, WorkError) as error:
@@ -192,15 +194,15 @@ def _gathered(
 def _channel(
     settings: Settings, machine: str, c: Champion, model: StoredModel | None, batches: Sequence[Batch], trouble: str
 ) -> dict[str, Any]:
-    """A channel: machine, channel, model, provisional; of the champion: version, cell, since, trained_at, reason, the
-    error to expect; `seen`: runs that it was trained on, with the last one's start; `runs`: the newest runs in the
-    lake, oldest first, with their distance from the trained region in widths and, where they are newer than the
-    training, the champion's S; `sensors`: channels without usable values in them; `unknown`: why something could not be
-    found out."""
+    """A channel: machine, channel, model, version (of the champion), provisional; of the champion, or the provisional
+    version that stands in for it: cell, since (as champion), trained_at, reason, the error to expect; `seen`: runs that
+    it was trained on, with the last one's start; `runs`: the newest runs in the lake, oldest first, with their distance
+    from the trained region in widths and, where they are newer than the training, the model's S; `sensors`: channels
+    without usable values in them; `unknown`: why something could not be found out."""
     from pipelines.store.tracking import load_training
 
     ids, starts = set[str](), list[str]()
-    if c.version is not None:
+    if c.source:
         try:
             table = load_training(c.tags.get("training_id", ""), settings).result.batches
             ids, starts = set(table["batch_id"].astype(str)), sorted(s for s in table["start"].map(_date) if s)

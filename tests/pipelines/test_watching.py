@@ -32,6 +32,7 @@ from pipelines.jobs import training
 from pipelines.jobs.recordings import home_lake, load_batches
 from pipelines.jobs.request import TrainRequest
 from pipelines.store import model_store, registry
+from reports.fleet import write_fleet_page
 from tests.toys.command import in_process
 from tests.toys.small_year import recording, write_machine, write_year
 
@@ -181,6 +182,24 @@ def test_a_model_that_cannot_be_read_is_said(place: Place) -> None:
     finally:
         (folder / "arrays.npz").write_bytes(arrays)
         kept.unlink(missing_ok=True)
+
+
+def test_a_provisional_version_has_its_figures(place: Place, tmp_path: Path) -> None:
+    client, name, before = registry.open_store(place.settings), f"{NAME}-z", place.states()["z"]
+    try:
+        client.delete_registered_model_alias(name, "champion")
+        client.set_registered_model_alias(name, "provisional", "1")
+        z = place.states()["z"]
+        assert (z["version"], z["provisional"], z["family"]) == (None, 1, "ridge") and before["expected_S_um"] > 0
+        assert all(z[k] == before[k] for k in ("expected_S_um", "bound90_S_um", "n_seen", "last_seen", "runs"))
+        view = fleet_view(place.home, [z])
+        assert not [a for a in view.alerts if a.channel]  # nothing runs at the machine
+        write_fleet_page(tmp_path / "fleet.html", view.rows, [], [], datetime.now(UTC))
+        page = (tmp_path / "fleet.html").read_text().replace("\N{NO-BREAK SPACE}", " ")
+        assert "v1 provisional" in page and f"{z['expected_S_um']:.3g} µm" in page
+    finally:
+        client.delete_registered_model_alias(name, "provisional")
+        client.set_registered_model_alias(name, "champion", "1")
 
 
 def test_the_command_shows_it_and_fails_on_alert(

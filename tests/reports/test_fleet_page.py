@@ -75,6 +75,10 @@ def test_the_page_is_whole_and_escaped(tmp_path: Path) -> None:
     assert text.count("<a href=") == 3 and '<a href="r/a%20b.html">mill z</a>' in text
     page = fleet_page([row_of("mill", simulated=True), row_of("hmc", simulated=True)], [], [], NOW)
     assert page.simulated  # then the title says so, and no row
+    untrained = UNKNOWN | {"unknown": ""}
+    assert not fleet_page([untrained], [], [], NOW).simulated  # recorded, whether or not a model has seen it
+    assert fleet_page([untrained | {"simulated": True}], [], [], NOW).simulated
+    assert not fleet_page([UNKNOWN | {"unknown": "nothing ingested"}], [], [], NOW).simulated
     with pytest.raises(InputError, match="unsupported file extension"):
         write_fleet_page(tmp_path / "fleet.md", [], [], [], NOW)
 
