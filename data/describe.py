@@ -37,8 +37,9 @@ class Shown:
     numbers: tuple[float, ...] = ()
 
 
-def drafted(files: Sequence[Path], form: Form | None = None) -> tuple[str, dict[str, list[Shown]]]:
-    """YAML text of a machine file for recordings of one machine, and the columns of the first file of each kind.
+def drafted(files: Sequence[Path], form: Form | None = None) -> tuple[str, dict[str, list[Shown]], int]:
+    """YAML text of a machine file for recordings of one machine, the columns of the first file of each kind, and how
+    many runs there are.
 
     Files with the same columns are the recordings. Files or sheets with other columns are drafted as
     `recording.joined` where names, sheets or time stamps show that they belong to the recordings, and else left out.
@@ -56,7 +57,7 @@ def drafted(files: Sequence[Path], form: Form | None = None) -> tuple[str, dict[
     machine = parse_machine(text.replace(FILL_IN, "1 s"), "draft")
     if FILL_IN not in text and (trouble := _tried(groups[0].paths[0], machine)):
         text = f"{CHECK}{trouble}\n{text}"
-    return text, {g.paths[0].name: _shown(g, machine) for g in groups}
+    return text, {g.paths[0].name: _shown(g, machine) for g in groups}, len(groups[0].tables)
 
 
 def _belonging(found: list[Group], left_out: list[str]) -> tuple[list[Group], list[str]]:
@@ -246,10 +247,12 @@ def _channels(group: Group, linked: dict[str, Guess], taken: list[str]) -> list[
     name_of = {n: name for name, n in given.items()}
     of_group = {i for g in group.position_groups for i in g.places}
     source = {} if group.key == "file" else {"source": group.key}
-    for name, key in given.items():
+    free = [name for name, key in given.items() if group.names[key] not in of_group]
+    errors = {n: group.column(given[n]) for n in free if group.roles[given[n]].value == "error"}
+    largest = iter(sorted(errors, key=lambda n: -np.ptp(guess.seen_range(errors[n]))))
+    for name in (next(largest) if n in errors else n for n in free):
+        key = given[name]
         i = group.names[key]
-        if i in of_group:
-            continue
         values, role = group.column(key), group.roles[key]
         along = Guess(name_of[linked[key].value], linked[key].why) if key in linked else None
         unit = group.unit(i) or guess.unit(role.value, group.table.title(i), values)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -68,7 +70,7 @@ def forward_gap(batches: Sequence[Batch]) -> list[Fold]:
 
 def _forward(batches: Sequence[Batch], gap_days: float) -> list[Fold]:
     order = in_time(batches)
-    first = max(_LEAST_PAST, min(len(order) // 2, len(order) - FORWARD_BLOCKS))
+    first = _first(len(order))
     length = (len(order) - first) // FORWARD_BLOCKS
     cuts = range(first, len(order), length)
     names = _block_names([[batches[k] for k in order[at : at + length]] for at in cuts])
@@ -82,6 +84,11 @@ def _forward(batches: Sequence[Batch], gap_days: float) -> list[Fold]:
         if len(past) >= _LEAST_PAST:
             folds.append(Fold(name, tuple(past), tuple(block)))
     return folds
+
+
+def _first(runs: int) -> int:
+    """How many of the runs train the first model."""
+    return max(_LEAST_PAST, min(runs // 2, runs - FORWARD_BLOCKS))
 
 
 def forward_obstacle(batches: Sequence[Batch]) -> str:
@@ -240,6 +247,22 @@ class PromotionRule(BaseModel):
     def only(self, protocol: str) -> Self:
         """The same rule, judging by one protocol."""
         return self.model_copy(update={"protocols": {protocol: 1.0}})
+
+    @property
+    def least_tested(self) -> int:
+        """Fewest left-out runs with which the paired comparison reaches `significance`, should all be better."""
+        return max(self.min_batches, math.ceil(-math.log2(self.significance)))
+
+    def few(self, runs: int, ordered: bool) -> str:
+        """How many runs a champion needs and how many there are; empty where there are enough.
+
+        Args:
+            ordered: their order in time is known, so that only later runs are left out.
+        """
+        later = ordered and next(iter(self.protocols)) == "forward"
+        needed = next(n for n in count(_LEAST_PAST) if n - later * _first(n) >= self.least_tested)
+        there = f"there {'is' if runs == 1 else 'are'} {runs}"
+        return f"a champion needs at least {needed} runs, {there}" if runs < needed else ""
 
     def offered(self, run: Collection[str]) -> list[str]:
         """The rule's protocols among those that were run."""

@@ -44,7 +44,8 @@ class Choice:
     are of this protocol. The nested score predicts every run by the cell that the other runs chose, under the same
     protocol. `standing`: "champion", where it is shown to be better than no model; "provisional", where it is expected
     to be, and is in two of three runs, but this is not shown beyond doubt; "refused", where it may harm.
-    `caution` is why it is no champion. `authority` is the share of the correction that a provisional model is worth.
+    `caution` is why it is no champion; `lacking` how many runs a champion needs, where there are fewer. `authority` is
+    the share of the correction that a provisional model is worth.
     """
 
     protocol: str
@@ -63,6 +64,7 @@ class Choice:
     nested_S_std_um: float = float("nan")
     standing: Standing = "champion"
     authority: float = 1.0
+    lacking: str = ""
 
     @property
     def trusted(self) -> bool:
@@ -315,7 +317,15 @@ def decide(result: GridResult, rule: PromotionRule, cell: str = "") -> Choice:
         else:
             choice = replace(choice, standing="refused")
             summary += f"; {choice.caution}: no trustworthy model"
-    return replace(choice, summary=summary)
+    return replace(choice, summary=summary, lacking=lacking(result, rule, choice))
+
+
+def lacking(result: GridResult, rule: PromotionRule, choice: Choice) -> str:
+    """How many runs a champion needs and how many there are; empty where enough are left out."""
+    if choice.n_batches >= rule.least_tested:
+        return ""
+    dated = bool(len(result.batches)) and all(map(str, result.batches["start"].fillna("")))
+    return rule.few(len(result.batches), dated or choice.protocol == "forward")
 
 
 def authority(curves: pd.DataFrame, choice: Choice) -> float:

@@ -186,9 +186,10 @@ def describe(
     from data.describe import drafted, notes
     from data.machine import Form
     from data.yaml_file import parse_yaml
+    from pipelines.settings import load
 
     keys = "\n".join(": ".join(text.split("=", 1)) for text in given or ())
-    text, columns = drafted(files, parse_yaml(keys or "{}", Form, "describe --set"))
+    text, columns, runs = drafted(files, parse_yaml(keys or "{}", Form, "describe --set"))
     if show:
         for name, shown in columns.items():
             _print_columns(name, shown)
@@ -199,6 +200,8 @@ def describe(
         console.line(
             f"{to}: a draft; check every line marked 'guessed', then call `thermodrift ingest --machine {to} …`"
         )
+    if few := load().promotion.few(runs, ordered=True):
+        console.note(f"{few}; with fewer `train` makes a provisional model at most")
     for note in notes(text):
         console.note(f"check: {note}")
 

@@ -16,6 +16,7 @@ from pipelines.options import Json, MachineFile, names, split
 if TYPE_CHECKING:
     import pandas as pd
 
+    from models.selection.promotion import Choice
     from pipelines.jobs.training import TrainOutcome
 
 DETAILS = ".txt"  # next to the report
@@ -96,8 +97,9 @@ def _sentence(outcome: TrainOutcome, target: str) -> str:
 def _badge(outcome: TrainOutcome, target: str) -> str:
     """What was lost of a channel, and whether its choice is no champion."""
     choice = outcome.choices[target]
-    standing = "provisional; " if choice.standing == "provisional" else ""
-    refused = "no trustworthy model; " if choice.caution and not standing else ""
+    few = f", {choice.lacking}" if choice.lacking else ""
+    standing = f"provisional{few}; " if choice.standing == "provisional" else ""
+    refused = f"no trustworthy model{few}; " if choice.caution and not standing else ""
     return f"{outcome.account.warning(target) if outcome.account else ''}{standing}{refused}"
 
 
@@ -110,12 +112,13 @@ def print_details(outcome: TrainOutcome) -> None:
         text = f"{target}: {_badge(outcome, target)}{expected.summary}"
         console.line(in_error_unit(text, outcome.units[target]))
     for target, result in outcome.results.items():
-        _print_leaderboard(f"{outcome.machine} {target}{label}", result.cells, outcome.units[target])
+        chosen = outcome.choices.get(target)
+        _print_leaderboard(f"{outcome.machine} {target}{label}", result.cells, outcome.units[target], chosen)
     for target, result in outcome.results.items():
         _print_race(f"{outcome.machine} {target}{label}", result.race, outcome.units[target])
-    for target, training in outcome.training_ids.items():
+    for target in (t for t in outcome.results if t in outcome.training_ids):
         promotion = outcome.promotions.get(target)
-        said = promotion.summary if promotion else f"training {target} {training}"
+        said = promotion.summary if promotion else f"training {target} {outcome.training_ids[target]}"
         console.line(in_error_unit(said, outcome.units[target]))
         if promotion and promotion.faults:
             console.line(f"  {promotion.faults}")
@@ -128,20 +131,27 @@ def _shown_protocol(cells: pd.DataFrame) -> str:
     return next(p for p in PROTOCOLS if p in set(cells["protocol"]))
 
 
-def _print_leaderboard(title: str, cells: pd.DataFrame, unit: str) -> None:
-    """The best cell of each family, S_mean ± S_std by protocol; the baseline without a model is always shown."""
+def _print_leaderboard(title: str, cells: pd.DataFrame, unit: str, chosen: Choice | None = None) -> None:
+    """The chosen cell, marked, and the best cell of each family, S_mean ± S_std by protocol; the baseline without a
+    model is always shown."""
     protocols = [p for p in _SHOWN_PROTOCOLS if (cells["protocol"] == p).any()] or [_shown_protocol(cells)]
     keys = ["selector", "family", "n_tsp"]
     rows = cells[cells["protocol"].isin(protocols)]
     worst = rows.assign(score=rows["S_mean_um"] + rows["S_std_um"].fillna(0.0)).groupby(keys, sort=False)["score"].max()
-    best = worst.sort_values().reset_index().drop_duplicates("family")
+    best = worst.sort_values().reset_index()
+    best["cell"] = best[keys].astype(str).agg("|".join, axis=1)
+    own_cell = chosen.cell if chosen else ""
+    best = best[(best["cell"] == own_cell) | ~best["family"].duplicated()]
+    shown = {"zero", *best["family"].unique()[:SHOWN]}
     heads = [_SHOWN_PROTOCOLS.get(p, p) for p in protocols]
     names = ("family", "selector")
     table = console.table(f"{title}, S mean ± std, {unit_label(unit) or 1}", *names, "n", *heads, left=names)
-    for row in best[(best["family"] == "zero") | best["family"].isin(best["family"].head(SHOWN))].to_dict("records"):
+    for row in best[(best["cell"] == own_cell) | best["family"].isin(shown)].to_dict("records"):
         own = rows[(rows[keys] == [row[k] for k in keys]).all(axis=1)].set_index("protocol")
         scores = [_score(own, p) for p in protocols]
-        table.add_row(row["family"], row["selector"], str(own["n_inputs"].iloc[0]), *scores)
+        table.add_row(
+            "* " * (row["cell"] == own_cell) + row["family"], row["selector"], str(own["n_inputs"].iloc[0]), *scores
+        )
     console.out.print(table)
 
 

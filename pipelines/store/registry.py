@@ -252,7 +252,7 @@ def _register(
     elif champion is None and choice.standing == PROVISIONAL and not dear:
         outcome = "provisional"
     replaces = outcome == CHAMPION
-    reason = f"{why}, {choice.caution}" if choice.caution else why
+    reason = ", ".join(filter(None, (why, choice.caution, choice.lacking)))
     against = "" if champion is None else str(champion.version)
     tags = {"reason": reason, "against": against, "replaces": against if replaces else ""}
     if begun is None:

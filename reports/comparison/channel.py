@@ -13,7 +13,7 @@ import pandas as pd
 from data.errors import InputError
 from models.protocols import PromotionRule
 from models.selection.outlook import Outlook, outlook
-from models.selection.promotion import BASELINES, Choice, ranked
+from models.selection.promotion import BASELINES, Choice, lacking, ranked
 from models.selection.result import GridResult, Training
 from reports.comparison.story import Verdict, mark_of, promoted_cell, verdict
 from reports.comparison.tables import MAIN_PROTOCOL, best_per, protocols_of, scored, scores_of
@@ -117,8 +117,9 @@ def removed(runs: pd.DataFrame, cost: float = 1.0) -> tuple[float, float]:
     return share, float(np.sqrt((n - 1) / n * np.sum((each - each.mean()) ** 2)))
 
 
-def sentence(c: Channel) -> tuple[Text, ...]:
-    """What the channel's model removes of the error of runs that it has not seen, and what to doubt about it."""
+def sentence(c: Channel, rule: PromotionRule) -> tuple[Text, ...]:
+    """What the channel's model removes of the error of runs that it has not seen, how many runs a champion lacks, and
+    what to doubt about it."""
     of = "later runs" if c.expected.protocol == "forward" else "left-out runs"
     S, none, bound = (f"{number(v, c.digits)} µm" for v in (c.expected.S_um, c.none_um, c.expected.bound_um))
     share = _share(*removed(c.runs, c.cost))
@@ -130,6 +131,8 @@ def sentence(c: Channel) -> tuple[Text, ...]:
     below = int((c.runs["S_um"] <= c.expected.bound_um).sum())
     tested = f"{below} of {count(len(c.runs), 'left-out run')} stay below the 90 % bound of {bound}."
     doubts = [c.verdict.caution, *(f"{t[:1].upper()}{t[1:]}." for t in (c.expected.warning, c.expected.note) if t)]
+    if c.verdict.outcome != "champion" and (few := lacking(c.result, rule, c.choice)):
+        text = f"{text.removesuffix('.')}; {few}."
     lead = Text(f"{text} {tested}" if len(c.runs) else text, "lead", f"{c.name}:")
     return (lead, *(Text(t, "caution") for t in doubts if t))
 

@@ -38,7 +38,7 @@ def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
     channels.sort(key=lambda c: -np.nan_to_num(c.none_um))
     units = {c.unit for c in channels}
     unit = unit_label(units.pop()) if len(units) == 1 else "own unit"
-    said = [with_unit(text, c.unit) for c in channels for text in sentence(c)]
+    said = [with_unit(text, c.unit) for c in channels for text in sentence(c, rule)]
     left_out = pictures.left_out_panels(channels)
     models = given(pictures.tried_panel(channels), pictures.time_panel(channels))
     blocks = given(

@@ -166,7 +166,7 @@ def test_separator_decimal_and_encoding_can_be_given(tmp_path: Path, separator: 
 def test_header_rows_and_units_row_can_be_given(tmp_path: Path) -> None:
     lines = ["1,2,3", "Time,T_front,z_um", "4,5,6", "s,°F,mm", *rows("{s},{F},{z_mm}")]
     path = saved(tmp_path, "a.csv", lines)
-    text, _ = drafted([path], Form(header_rows=4, units_row=4))
+    text = drafted([path], Form(header_rows=4, units_row=4))[0]
     assert "header_rows: 4" in text
     batch = read(path, text)
     assert batch.values("T_front") == pytest.approx(FRONT, abs=6e-3) and batch.values("z_um") == pytest.approx(Z)
@@ -206,7 +206,7 @@ def test_a_time_in_no_known_format_is_named(tmp_path: Path) -> None:
 
 def test_every_column_is_shown_with_what_becomes_of_it(tmp_path: Path) -> None:
     path = saved(tmp_path, "a.csv", ["No,Time,front [°F],z_um,note", *rows("{i},{t:%Y-%m-%d %H:%M},{F},{z},ok")])
-    _, shown = drafted([path])
+    _, shown, _ = drafted([path])
     assert [(c.column, c.becomes) for c in shown["a.csv"]] == [
         ("No", "left out: numbers the rows, or is another clock"), ("Time", "clock: its cells look like it"),
         ("front [°F]", "temperature front, degF → degC"), ("z_um", "error z_um, um"),
@@ -297,7 +297,7 @@ def test_a_log_of_a_3d_printer(tmp_path: Path) -> None:
     table = [f"{i - i // 50},{0.098 * (1 - np.exp(-i / 60)):.4f},{210 - 185 * np.exp(-i / 9):.2f},{f}"
              for i, f in enumerate(FRONT)]  # fmt: skip
     path = saved(tmp_path, "klipper.csv", ["sample,mcu_pos_z,he_t,bed_t", *table])
-    text, shown = drafted([path])
+    text, shown, _ = drafted([path])
     machine = parse_machine(text.replace("? s", "2 s"), "draft")
     assert {n: c.role for n, c in machine.channels.items()} == {
         "mcu_pos_z": "error", "he_t": "temperature", "bed_t": "temperature",
@@ -322,7 +322,7 @@ def test_names_of_channels_can_be_typed(tmp_path: Path, micro: str) -> None:
 def test_fractions_of_the_clock_and_alarms_are_no_channels(tmp_path: Path) -> None:
     head = "Time,us,ms,Alarm 101,min,T1,z_um"
     path = saved(tmp_path, "a.csv", [head, *rows("{t:%Y-%m-%d %H:%M},{F},{b},0,{f},{f},{z}")])
-    text, shown = drafted([path])
+    text, shown, _ = drafted([path])
     assert parse_machine(text, "draft").ignore == ["us", "ms", "Alarm 101"]
     assert [c.becomes for c in shown["a.csv"][1:4]] == 2 * ["left out: a part of the clock"] + ["left out: an alarm"]
     assert list(parse_machine(text, "draft").channels) == ["min", "T1", "z_um"]

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from scipy import stats
 
 from data.errors import InputError
-from models.protocols import PromotionRule
+from models.protocols import PromotionRule, forward, leave_batch_out
 from models.selection import promotion
 from models.selection.promotion import choose, compare_paired, left_out, pick, sign_flip_p
 from models.selection.result import GridResult
@@ -236,6 +237,18 @@ def test_four_batches_show_nothing():
     assert promotion.decide(result, RULE).caution == (
         "not shown to be better than no model (4 batches in common, need at least 5)"
     )
+
+
+@pytest.mark.parametrize(("runs", "ordered", "needed"), [(4, True, 9), (8, True, 9), (9, True, 0), (4, False, 5)])
+def test_how_many_runs_a_champion_needs(runs, ordered, needed):
+    rule = PromotionRule()
+    assert rule.few(runs, ordered) == (f"a champion needs at least {needed} runs, there are {runs}" if needed else "")
+    batches = [replace(b, start=pd.Timestamp("2026-01-01") + pd.Timedelta(days=k))
+               for k, b in enumerate(toy_batches("toy-few", max(runs, needed)))]  # fmt: skip
+    tested = sum(len(f.test) for f in (forward if ordered else leave_batch_out)(batches))
+    assert tested >= rule.least_tested and promotion.sign_flip_p(np.ones(tested)) <= rule.significance
+    assert rule.least_tested == rule.min_batches == 5 and rule.model_copy(update={"min_batches": 2}).least_tested == 5
+    assert promotion.sign_flip_p(np.ones(4)) > rule.significance
 
 
 def test_a_mixed_newcomer_does_not():

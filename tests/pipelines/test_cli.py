@@ -142,6 +142,8 @@ def test_describe_drafts_a_file_that_ingests(
     files = sorted((year / "in").glob("*.csv"))
     done = call("describe", *files)
     assert done.code == 0 and "# guessed" in done.out and "front:" in done.out
+    assert done.out.index("\n  z:") < done.out.index("\n  x:"), "the largest error first"
+    assert "a champion needs at least 9 runs, there are 6" in done.err
     draft = tmp_path / "draft.yml"
     done = call("describe", *files, "--out", draft)
     assert done.code == 0 and "a draft; check every line marked 'guessed'" in done.out

@@ -5,10 +5,12 @@ from __future__ import annotations
 import io
 import threading
 
+import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
 
+from models.selection.promotion import Choice
 from pipelines import console
 from pipelines.caller import DirectCaller
 
@@ -119,3 +121,17 @@ def test_the_main_table_shows_whole_names_in_80_columns(monkeypatch: pytest.Monk
     lines = out.getvalue().splitlines()
     assert max(map(len, lines)) <= 80 and "hist_gradient_boosting" in lines[3] and "sequential_forward" in lines[3]
     assert lines[3].count("24.7±14.8") == 3
+
+
+def test_the_chosen_cell_has_its_row_beside_the_best_of_its_family(monkeypatch: pytest.MonkeyPatch) -> None:
+    from pipelines.commands.train import SHOWN, _print_leaderboard
+
+    out = io.StringIO()
+    monkeypatch.setattr(console, "out", Console(file=out, width=80, soft_wrap=True))
+    families = [*(f"f{k}" for k in range(SHOWN)), "ridge", "ridge"]
+    cells = pd.DataFrame({"selector": "none", "family": families, "n_tsp": range(SHOWN + 2), "n_inputs": 1,
+                          "protocol": "forward", "S_mean_um": np.arange(SHOWN + 2.0), "S_std_um": 0.5})  # fmt: skip
+    chosen = Choice("forward", "none", "ridge", SHOWN + 1, ("a",), 9.0, 9.0, 0.5, 1.0, 6, "", "")
+    _print_leaderboard("m z", cells, "um", chosen)
+    rows = out.getvalue().splitlines()[3:]
+    assert len(rows) == SHOWN + 1 and [r for r in rows if "ridge" in r] == [rows[-1]] and "* ridge" in rows[-1]

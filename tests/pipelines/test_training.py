@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,8 @@ from data.lake import Lake
 from models.families import FAMILIES
 from models.selection.crossing import Plan
 from pipelines.caller import DirectCaller
-from pipelines.commands.predict import predict_file
+from pipelines.commands.predict import load_model, predict_file
+from pipelines.commands.train import print_training, training_dict
 from pipelines.jobs.recordings import load_batches
 from pipelines.jobs.request import TrainRequest
 from pipelines.jobs.training import TrainOutcome, promote_tracked, train
@@ -225,6 +227,27 @@ def test_two_batches_train_and_one_does_not(home: Path, store: Any, tmp_path: Pa
     promotion = outcome.promotions["z"]
     assert (promotion.outcome, promotion.champion_version) == ("challenger", None)
     assert promotion.caution == "not shown to be better than no model (2 batches in common, need at least 5)"
+
+
+def test_few_runs_are_counted_and_the_largest_error_comes_first(
+    home: Path, store: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    machine = write_machine(tmp_path / "m.yml", "small-few")
+    write_year(tmp_path / "in", 4)
+    plan = Plan(("none",), ("zero", "ridge"), ("forward", "leave-batch-out"))
+    request = TrainRequest(machine, (tmp_path / "in",), ("x", "z"), plan, report=tmp_path / "r.html")
+    outcome = train(request, store, DirectCaller())
+    print_training(outcome)
+    few = "a champion needs at least 9 runs, there are 4"
+    first, second = capsys.readouterr().out.splitlines()[:2]
+    assert first.startswith("z: ") and second.startswith("x: ") and few in first and few in second
+    assert list(training_dict(outcome)["expected"]) == ["z", "x"]
+    sentences = re.findall(r'<p class="lead">(.*?)</p>', (tmp_path / "r.html").read_text())
+    assert [s.index(f"; {few}. ") < s.index("stay below") for s in sentences] == [True, True]
+    details = (tmp_path / "r.txt").read_text()
+    assert details.count("* ridge") == 2 and details.index("small-few z") < details.index("small-few x")
+    with pytest.raises(InputError, match=f"has no champion: .*{few}; name a version"):
+        load_model("models:/small-few-z@champion", store)
 
 
 def test_a_batch_without_a_usable_target_does_not_train_for_ever(home: Path, store: Any, tmp_path: Path) -> None:
