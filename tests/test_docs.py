@@ -6,8 +6,10 @@ import re
 import runpy
 import shlex
 import sys
+from functools import cache
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 from documented import Block, Session, blocks, commands, differs
@@ -92,13 +94,19 @@ def _shown() -> list[Block]:
     return [b for page in PAGES for b in blocks(page) if b.language in ("", "sh", "console")]
 
 
-def _parameters(arguments: list[str]) -> list[str]:
-    """What is wrong with a command line: an unknown command, an unknown option."""
+@cache
+def _program() -> Any:
+    """The commands; to make them takes tens of ms."""
     import typer.main
 
     from pipelines.cli import app
 
-    command = typer.main.get_command(app)
+    return typer.main.get_command(app)
+
+
+def _parameters(arguments: list[str]) -> list[str]:
+    """What is wrong with a command line: an unknown command, an unknown option."""
+    command = _program()
     while getattr(command, "commands", None) and arguments and arguments[0] in command.commands:
         command, arguments = command.commands[arguments[0]], arguments[1:]
     if getattr(command, "commands", None) and not getattr(command, "invoke_without_command", False):
@@ -155,13 +163,9 @@ def test_every_registered_member_has_its_place_in_the_reference(build) -> None:
 
 
 def test_every_command_and_option_is_in_the_reference(build) -> None:
-    import typer.main
-
-    from pipelines.cli import app
-
     text = build.cli_page()
     sections = dict(re.findall(r"^## (thermodrift [\w -]+)\n(.*?)(?=^## |\Z)", text, flags=re.M | re.S))
-    for name, command in build._commands("thermodrift", typer.main.get_command(app)):
+    for name, command in build._commands("thermodrift", _program()):
         assert all(f"`{o}`" in sections[name] for p in command.params for o in p.opts if o.startswith("-")), name
 
 
