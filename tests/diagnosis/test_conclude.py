@@ -101,6 +101,12 @@ GATE = {"law": "draught", "acts_on": "room", "parameters": OPENED}
 
 
 @cache
+def gated() -> Fitted:
+    """Two bodies and a gate that the machine file does not know."""
+    return fitted(two_bodies(), runs(two_bodies(), {"gate": GATE}))
+
+
+@cache
 def four() -> Fitted:
     return fitted(four_bodies(), runs(four_bodies()))
 
@@ -110,8 +116,7 @@ def proposal(now: Fitted, mechanism: str, where: Where) -> Candidate:
 
 
 def test_a_law_that_states_its_window_is_at_work_within_it_in_every_batch() -> None:
-    known = two_bodies()
-    now = fitted(known, runs(known, {"gate": GATE}))
+    now = gated()
     c = Candidate("draught", Where("node", "room"), "gate", "a gate", MechanismPart.model_validate(GATE))
     done = refitted(now, c.applied(now.part))
     regime, windows = activity(done, c)
@@ -145,8 +150,7 @@ def test_what_nothing_switches_is_always_at_work() -> None:
 
 def test_a_parameter_that_does_nothing_at_its_place_is_not_told() -> None:
     """A draught multiplies what exposures exchange; where only the air of the room is colder, nothing is multiplied."""
-    known = two_bodies()
-    now = fitted(known, runs(known, {"gate": GATE}))
+    now = gated()
     c = proposal(now, "draught", Where("node", "room"))
     done = refit(now, Scored(c, amplitudes={"drop": 5.0}))
     assert done is not None

@@ -6,6 +6,7 @@ import difflib
 import json
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -370,10 +371,14 @@ def test_a_value_alone_is_a_change() -> None:
     assert changed_parts(PART, after) == {"mechanisms.belt": belt}
 
 
+@cache
+def fitted_with_own_powers(count: int) -> Fitted:
+    return fitted(two_bodies(mechanisms__belt__parameters__power=POWER), runs(two_bodies(), count=count))
+
+
 def varying(sizes: list[float]) -> Fitted:
     """A fit in which the batches' deviations are these, in units of their prior."""
-    known = two_bodies(mechanisms__belt__parameters__power=POWER)
-    done = fitted(known, runs(two_bodies(), count=len(sizes)))
+    done = fitted_with_own_powers(len(sizes))
     at = done.problem.nuisances.shared - 1
     own = [np.concatenate([v[:at], [size], v[at + 1 :]]) for v, size in zip(done.own, sizes, strict=True)]
     out = replace(done)
