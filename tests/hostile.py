@@ -18,6 +18,7 @@ from compensation.contracts import Correction, Sample
 from compensation.runtime import Compensator
 from compensation.safety import STATES, Limits
 from compensation.serving import _Line
+from compensation.substitutes import GuardLimits
 from tests.compensation import test_runtime as toy
 from tests.compensation.test_any_order import InMemory
 from tests.toys.exported import C, export_of, offset_only
@@ -173,7 +174,7 @@ class Stream:
         self.record, self.faults, self.doubted = InMemory(Path("record")), dict[str, Callable[..., None]](), False
         self.last: Sample | None = None
         self.samples = self.active = 0
-        self.restarts, self.stopped = -1, False
+        self.restarts, self.stopped, self.hurt = -1, False, False
         self.start()
 
     # ----- the computer and its link to the control
@@ -257,10 +258,12 @@ class Stream:
 
     def odd(self) -> None:
         names = self.dice.sample(toy.INPUTS, self.dice.randint(1, 2))
+        self.hurt = True
         self.give(damage=lambda values: values.update({n: self.dice.choice(ODD) for n in names}))
 
     def missing(self) -> None:
         name = self.dice.choice(toy.INPUTS)
+        self.hurt = True
         self.give(damage=lambda values: values.pop(name))
 
     def reading(self) -> None:
@@ -324,6 +327,8 @@ class Stream:
         if self.stopped:
             self.operator()
         needed = int(LIMITS.warm_up_s / self.every_s) + 3
+        needed += GuardLimits().back_samples if self.hurt else 0  # the guard first sees the sensors agree again
+        self.hurt = False
         states = [self.give() for _ in range(needed)]
         if "active" not in states and self.doubted:  # the sensors contradicted each other: the operator confirms them
             self.line.machine.confirm()
