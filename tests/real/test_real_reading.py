@@ -48,11 +48,11 @@ def test_lathe_runs_with_their_schedule():
     machine = parse_machine(LATHE, "test")
     files, others = recording_files(REAL / "lathe_gv1203", machine)
     assert len(files) == 32 and others == []
-    rows = 0
+    rows, read = 0, {}
     for path in files:
         (batch,) = read_batches(path, machine)
         raw = pd.read_csv(path)
-        rows += batch.repairs["rows_in"]
+        rows, read[batch.batch_id] = rows + batch.repairs["rows_in"], batch
         assert batch.repairs["rows_in"] == len(raw) == batch.repairs["rows_used"] + batch.repairs["rows_dropped"]
         t = (raw["Time"] - raw["Time"][0]) * 60
         expected = np.interp(batch.time_s, t, raw["PT01"])
@@ -60,7 +60,7 @@ def test_lathe_runs_with_their_schedule():
         assert batch.start == pd.Timestamp(path.stem)
         assert not np.isnan(batch.values("rpm")).any()
     assert rows > 20_000
-    stop = {b.batch_id: b for p in files for b in read_batches(p, machine)}["20200810"]
+    stop = read["20200810"]
     assert [stop.values("rpm")[int(h * 60)] for h in (1, 2.4, 3.0, 3.6, 5.9)] == [1800, 1800, 0, 1200, 1200]
 
 

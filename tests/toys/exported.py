@@ -9,7 +9,9 @@ import subprocess
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -54,15 +56,26 @@ def export_of(*axes: ExportedAxis, machine: str = "mill 1", simulated: bool = Tr
     return Export(machine, "champion@production", "v7", DIGEST, "2026-01-02T03:04:05Z", simulated, axes)
 
 
+@cache
+def compiled(files: tuple[tuple[str, bytes], ...]) -> bytes:
+    """A library of these files, one of which is C; gcc takes most of a second."""
+    with TemporaryDirectory() as folder:
+        for name, content in files:
+            (Path(folder) / name).write_bytes(content)
+        (source,) = (name for name, _ in files if name.endswith(".c"))
+        command = ["gcc", *FLAGS, "-shared", "-fPIC", "-o", "library.so", source, "-lm"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
+        assert done.returncode == 0, done.stderr
+        return (Path(folder) / "library.so").read_bytes()
+
+
 class C:
-    """The compiled source of an export."""
+    """The compiled source of an export: each is loaded from a file of its own, and so has a state of its own."""
 
     def __init__(self, export: Export, key: str, folder: Path) -> None:
-        (source,) = (p for p in EXPORTS[key]().write(export, folder) if p.suffix == ".c")
         library = folder / f"{key}.so"
-        command = ["gcc", *FLAGS, "-shared", "-fPIC", "-o", str(library), str(source), "-lm"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
+        library.unlink(missing_ok=True)  # one that is loaded must not change
+        library.write_bytes(compiled(tuple((p.name, p.read_bytes()) for p in EXPORTS[key]().write(export, folder))))
         self.library, self.stem, self.n = ctypes.CDLL(str(library)), export.stem, len(export.axes)
 
     def call(self, name: str, *args: object) -> int:
