@@ -132,7 +132,7 @@ def sentence(c: Channel, rule: PromotionRule) -> tuple[Text, ...]:
     tested = f"{below} of {count(len(c.runs), 'left-out run')} stay below the 90 % bound of {bound}."
     doubts = [c.verdict.caution, *(f"{t[:1].upper()}{t[1:]}." for t in (c.expected.warning, c.expected.note) if t)]
     if c.verdict.outcome != "champion" and (few := lacking(c.result, rule, c.choice)):
-        text = f"{text.removesuffix('.')}; {few}."
+        text += f" {few[:1].upper()}{few[1:]}."
     lead = Text(f"{text} {tested}" if len(c.runs) else text, "lead", f"{c.name}:")
     return (lead, *(Text(t, "caution") for t in doubts if t))
 
