@@ -85,7 +85,7 @@ class C:
     def copy(self, folder: Path) -> C:
         """The same program with a memory of its own; one library is loaded once."""
         other = copy(self)
-        other.library = ctypes.CDLL(shutil.copy(self.library._name, folder))
+        other.library = ctypes.CDLL(str(shutil.copy(self.library._name, folder)))
         return other
 
     def restart(self) -> None:
