@@ -151,7 +151,7 @@ def control() -> str:
     ends = rows[rows["what"] != "stream"]
     assert int(ends["with_a_broken_invariant"].sum()) == 0, "state what was broken"
     n, each = int(ends["n"].sum()), ", ".join(f"{r.what}: {r.n}" for r in ends.itertuples())
-    moving = int(ends.set_index("what").loc["SIGKILL", "ended_while_moving"])
+    moving = int(ends.loc[ends["what"] == "SIGKILL", "ended_while_moving"].sum())
     longest_s = ends["largest_active_after_s"].astype(float).max()
     return (
         f"After {n} ends of `compensate` in closed loop with the receiver of an export ({each}; {moving} of the kills "
