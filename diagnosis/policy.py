@@ -160,6 +160,7 @@ class Policy:
     claim_min_probability: float = convention(
         0.7, "probability", "a false claim costs more than twice as much as a missed one"
     )
+    confirmed: int = cost(3, "explanations", "of a round; each takes structure drawn anew, as long as a baseline does")
     temperature_share: float = convention(0.05, "of the gain", "by as much structure scatters what explanations gain")
     temperature_min_nats: float = development(3.0, "nats", "wrong explanations lead by as much")
     max_effects: int = cost(4, "effects", "of one search")

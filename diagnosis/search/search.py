@@ -110,21 +110,22 @@ def decided(done: Round) -> Round:
     before all.
 
     Structure that is drawn about a fit without an effect may imitate one, or be made of what an effect would explain.
-    So the likeliest is confirmed, and the next one if it loses its place by that, until none is worth it.
+    So the likeliest is confirmed, and the next one if it loses its place by that; after a few, the best of them stays.
     """
     if not done.tried:
         return done
     strange = frozenset(i.channel for i in impossible(done.before))
     before, anew = _fair(done.before, done.tried), None
     tried = [_against(before, t) for t in done.tried]
-    while True:
-        tried.sort(key=lambda t: (not _resolves(t, strange), -t.standing))
+    for left in range(POLICY.confirmed, -1, -1):
+        tried.sort(key=lambda t: (not _resolves(t, strange), not (left or t.confirmed), -t.standing))
         first, found = tried[0], figures(before, tried)
         resolved = _resolves(first, strange)
-        if first.confirmed or resolved or found.probability < POLICY.grown_min_probability:
-            return replace(done, before=before, tried=tuple(tried), figures=found, resolved=resolved)
+        if not left or first.confirmed or resolved or found.probability < POLICY.grown_min_probability:
+            break
         anew = anew or _redrawn(before)
         tried[0] = _confirmed(first, anew)
+    return replace(done, before=before, tried=tuple(tried), figures=found, resolved=resolved)
 
 
 def _redrawn(fitted: Fitted) -> Fitted:

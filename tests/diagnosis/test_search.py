@@ -152,6 +152,16 @@ def test_an_explanation_that_structure_drawn_anew_does_not_bear_out_is_not_claim
     assert lost.confirmed and lost.gain == pytest.approx(0.0, abs=1e-6)
 
 
+def test_what_was_not_confirmed_is_not_claimed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After the last confirmation the best confirmed one stays, whatever others promise."""
+    r = found("drift").rounds[0]
+    monkeypatch.setattr(search_module, "structured", lambda fitted, runs: r.before)
+    monkeypatch.setattr(search_module, "POLICY", replace(POLICY, confirmed=1))
+    again = decided(r)
+    assert again.best is not None and again.best.confirmed and not again.accepted
+    assert any(t.gain > again.best.gain + 100.0 and not t.confirmed for t in again.tried)
+
+
 def test_where_no_twin_can_be_drawn_anew_a_claim_is_judged_by_its_own_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     def none(*_: Any) -> None:
         raise WorkError("no refined twin could be simulated")
