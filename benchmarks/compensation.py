@@ -101,10 +101,10 @@ def through(address: str, train: Sequence[Batch], left: Batch) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--through", help="address of a broker, such as mqtt://127.0.0.1:1883/hall/mill")
-    given_options = parser.parse_args()
+    asked = parser.parse_args()
     *train, left = make_toy_batches(8, 400, sensors=9)
-    if given_options.through:
-        through(given_options.through, train, left)
+    if asked.through:
+        through(asked.through, train, left)
         return
     print(f"{'family':<26} {'median':>9} {'99 %':>9}   of one row of the model, ms")
     for key, family in FAMILIES.items():

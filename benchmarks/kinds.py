@@ -108,7 +108,7 @@ def _drawn(kind: PlantKind, seed: int, paired: Kind | None, noises: float) -> tu
         drawn += 1
 
 
-def first_round(kind: PlantKind, seed: int, out: str, _: int, paired: Kind, noises: float) -> dict[str, Any]:
+def first_round(kind: PlantKind, seed: int, out: str, paired: Kind, noises: float) -> dict[str, Any]:
     """The first round of a paired case, as a row of `claims`; from its file where it is done already."""
     path = Path(out) / f"{kind}_{seed}_{paired}_first.json"
     if path.exists():
@@ -118,7 +118,7 @@ def first_round(kind: PlantKind, seed: int, out: str, _: int, paired: Kind, nois
     bodies = {name: sensor.at.partition("@")[0] for name, sensor in part.sensors.items()}
     begun = time.process_time()
     with threadpool_limits(limits=1):
-        batches, _rest = usable_batches(compile_network(case.machine, part=part), case.batches)
+        batches, _ = usable_batches(compile_network(case.machine, part=part), case.batches)
         done = one_round(baseline(case.machine, part, batches), Processes(), lambda step, n, of: None)
     row = {"kind": kind, "seed": spec.seed, "what": paired, "terms": case.truth["terms"],
            "rounds": [_round(done, key, bodies)], "cpu_s": round(time.process_time() - begun, 1)}  # fmt: skip
@@ -245,12 +245,10 @@ def _named(r: Mapping[str, Any]) -> int:
     return len({k for f in r["listed"] for k in f["of"]})
 
 
-def pairs(
-    kinds: Sequence[PlantKind], first: int, out: Path, noises: float
-) -> list[tuple[PlantKind, int, str, int, Kind, float]]:
-    """The cases of `--paired`, in turn over the kinds."""
+def pairs(kinds: Sequence[PlantKind], first: int) -> list[tuple[PlantKind, int, Kind]]:
+    """Kind, seed and what is concealed of the cases of `--paired`, in turn over the kinds."""
     return [
-        (kind, first - 1000 + 100 * k, str(out), 0, what, noises)
+        (kind, first - 1000 + 100 * k, what)
         for k in range(max(PAIRED.values())) for what, n in PAIRED.items() if k < n for kind in kinds
     ]  # fmt: skip
 
@@ -318,7 +316,9 @@ def main() -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     tasks: list[tuple[Any, ...]] = []
     if given.paired is not None:
-        tasks += pairs(given.kinds or KIND_PLANTS, given.paired, given.out, given.noises)
+        proposed = () if given.claims else (0,)
+        every = pairs(given.kinds or KIND_PLANTS, given.paired)
+        tasks += [(kind, seed, str(given.out), *proposed, what, given.noises) for kind, seed, what in every]
     else:
         seeds, kinds = range(given.first, given.first + given.cases), given.kinds or ["lathe", "board"]
         tasks += [(kind, seed, str(given.out), given.proposed) for seed in seeds for kind in kinds]
@@ -327,14 +327,16 @@ def main() -> None:
         for k, row in pool.completed(first_round if given.claims else examined, tasks):
             rows.append(row)
             effect = "+".join(f"{t['effect']} {t.get('sigma', 0):.1f}" for t in row["terms"]) or row["what"]
-            first = next(iter(row.get("listed", ())), {"name": row.get("trouble", "no claim")})
-            print(f"{tasks[k][0]:<10} {effect:<28} {first['name'][:60]}  {row.get('cpu_s', 0):.0f} s", flush=True)
+            first = row["rounds"][0]["tried"][:1] if given.claims else row.get("listed", ())
+            said = next((claim["name"] for claim in first), row.get("trouble", "no claim"))
+            print(f"{tasks[k][0]:<10} {effect:<28} {said[:60]}  {row.get('cpu_s', 0):.0f} s", flush=True)
     if given.table:
         write(given.table, as_rows(rows), f"python -m benchmarks.kinds --paired {given.paired} --table {given.table}")
     if given.claims:
         stored = claims(rows)
         write(given.claims, stored, f"python -m benchmarks.kinds --paired {given.paired} --claims {given.claims}")
-        print(fitted_weights(stored))
+        if stored["kind"].nunique() > 1:  # each is left out in turn
+            print(fitted_weights(stored))
         return
     print("\n".join([*table(rows), *(after_proposed(rows, given.proposed) if given.proposed else ())]))
 

@@ -81,7 +81,7 @@ def watched(guard: Guard, batch: Batch, names: Sequence[str], every: int = 1, li
     looks = list[Look]() if like is None else list(like.looks[: _alike(given, like.given)])
     watch = looks[-1].watch if looks else guard.begin()
     for k in range(len(looks), len(at)):
-        if any(look.gave_up for look in looks[-1:]) and any(look.untrusted for look in looks):
+        if looks and looks[-1].gave_up and any(look.untrusted for look in looks):
             break
         values = dict(zip(names, given[k].tolist(), strict=True))
         watch, checked = guard.step(watch, float(batch.time_s[at[k]]), values)

@@ -81,13 +81,13 @@ def copied_stores(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 ON_PREFECTS_SERVER = tuple(f"tests/pipelines/test_{n}.py" for n in ("flows", "diagnosis_flow", "retraining"))
 
 
-@pytest.hookimpl(optionalhook=True)
 def pytest_runtest_setup() -> None:
     """Where two threads log models at once, MLflow leaves a stand-in for a module without a file; Hypothesis reads the
     file of every module."""
     sys.modules.pop("dbutils", None)
 
 
+@pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """With --dist loadfile the files on Prefect's server share a process, since a server takes half a minute."""
     if config.getvalue("dist") != "loadfile":

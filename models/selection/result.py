@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from data.files import from_json
@@ -67,6 +68,11 @@ class GridResult:
     selector_diagnostics: pd.DataFrame = field(default_factory=pd.DataFrame)
     race: pd.DataFrame = field(default_factory=pd.DataFrame)
     stack: pd.DataFrame = field(default_factory=pd.DataFrame)
+
+    def none_um(self, protocol: str) -> float:
+        """Mean S of a protocol without a model, in the error's unit; NaN where it was not measured."""
+        of_none = (self.cells["family"] == "zero") & (self.cells["protocol"] == protocol)
+        return float(next(iter(self.cells.loc[of_none, "S_mean_um"]), np.nan))
 
     def save(self, folder: Path) -> None:
         """One Parquet file per table and `result.json`."""

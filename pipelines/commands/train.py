@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from data.errors import InputError, one_of
+from data.files import write_atomic
 from data.units import error_column, in_error_unit, unit_label
 from pipelines import console
 from pipelines.commands.ingest import ingest_totals, print_ingest
@@ -69,9 +72,10 @@ def print_training(outcome: TrainOutcome) -> None:
         console.line(f"diagnose {outcome.diagnosis_summary}")
     console.line(f"report   {outcome.report}")
     if outcome.report is not None:
-        details = outcome.report.with_suffix(DETAILS)
-        with details.open("w", encoding="utf-8") as file, console.printing_to(file):
+        details, text = outcome.report.with_suffix(DETAILS), io.StringIO()
+        with console.printing_to(text):
             print_details(outcome)
+        write_atomic(details, text.getvalue())
         console.line(f"details  {details}")
     console.line("seconds  " + ", ".join(f"{k} {v:g}" for k, v in outcome.seconds.items()))
 
@@ -81,10 +85,9 @@ def _sentence(outcome: TrainOutcome, target: str) -> str:
     expected, choice = outcome.outlooks.get(target), outcome.choices.get(target)
     promotion = outcome.promotions.get(target)
     parts = [f"{_badge(outcome, target)}{expected.headline}"] if expected else []
-    cells = outcome.results[target].cells
-    zero = cells[(cells["family"] == "zero") & (cells["protocol"] == (choice.protocol if choice else ""))]
-    parts += [f"no model {zero['S_mean_um'].iloc[0]:.3g} µm"] if len(zero) else []
-    parts += [choice.name] if choice else []
+    if choice:
+        none_um = outcome.results[target].none_um(choice.protocol)
+        parts += [f"no model {none_um:.3g} µm"] * math.isfinite(none_um) + [choice.name]
     if promotion is None:
         parts.append(f"training {outcome.training_ids.get(target, 'not tracked')}")
     elif promotion.outcome == "unchanged":

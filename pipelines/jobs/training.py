@@ -16,6 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
 from data.account import Account
@@ -271,17 +272,11 @@ def _judge(
         outcome.outlooks[t] = outlook(outcome.results[t], outcome.choices[t])
         readings = updated_scores(crossings[t], *cell, left_out.curves)
         outcome.results[t] = replace(outcome.results[t], readings=readings)
-    order = sorted(outcome.results, key=lambda t: -none_um(outcome.results[t], outcome.outlooks[t].protocol))
+    none_um = {t: result.none_um(outcome.outlooks[t].protocol) for t, result in outcome.results.items()}
+    order = sorted(none_um, key=lambda t: -np.nan_to_num(none_um[t]))
     tables: tuple[dict[str, Any], ...] = (outcome.results, outcome.choices, outcome.outlooks)
     for kept in tables:  # the largest error first
         kept.update([(t, kept.pop(t)) for t in order])
-
-
-def none_um(result: GridResult, protocol: str) -> float:
-    """Mean S without a model; 0 where it was not measured."""
-    cells = result.cells
-    zero = cells.loc[(cells["family"] == "zero") & (cells["protocol"] == protocol), "S_mean_um"]
-    return float(zero.iloc[0]) if len(zero) else 0.0
 
 
 @contextmanager
