@@ -16,6 +16,7 @@ from diagnosis.localisation.balance import impossible
 from diagnosis.policy import POLICY
 from diagnosis.screening.exchanged import suspected_swaps
 from diagnosis.screening.screen import Screen, likeness, one_of_each
+from diagnosis.search.claims import least_relative_gain
 from twin.compile import own_paths
 from twin.mechanisms import MECHANISMS
 
@@ -34,8 +35,9 @@ def odds_of(now: Fitted, seen: Screen) -> dict[str, float]:
 def shortlist(now: Fitted, seen: Screen, odds: dict[str, float]) -> list[Scored]:
     """What is refitted: the best by gain and odds, few of a mechanism; paths of heat to bodies that show what without
     one is impossible, whatever they gain in one linear step; and labels that are plainly exchanged."""
+    least = POLICY.refit_min_gain_share * least_relative_gain(POLICY.grown_min_probability) * abs(now.log_evidence)
     ranked = sorted(
-        (s for s in seen.scored if s.candidate.name in odds and s.gain > POLICY.refit_min_screen_gain_nats),
+        (s for s in seen.scored if s.candidate.name in odds and s.gain > least),
         key=lambda s: (-(s.gain + odds[s.candidate.name]), s.candidate.name),
     )
     taken: Counter[str] = Counter()
