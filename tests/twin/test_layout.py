@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from twin.views.layout import crossings, flattened, places, resistance_distance
+from twin.views.layout import crossings, places
 
 RING = {("a", "b"): 5.0, ("b", "c"): 1.0, ("c", "d"): 5.0, ("d", "a"): 1.0, ("a", "e"): 2.0, ("c", "f"): 30.0}
 PITCH = (2.0, 1.5)
@@ -13,8 +13,7 @@ PITCH = (2.0, 1.5)
 def n_crossings(at: dict[str, tuple[float, float]], links: dict[tuple[str, str], float]) -> int:
     names = list(at)
     ends = np.array([(names.index(a), names.index(b)) for a, b in links])
-    xy = np.array([at[n] for n in names])[None]
-    return int(crossings(xy[:, ends[:, 0]], xy[:, ends[:, 1]], ends)[0])
+    return crossings(np.array([at[n] for n in names]), ends)
 
 
 def test_a_ring_with_tails_has_no_crossing_and_every_body_its_own_place() -> None:
@@ -54,15 +53,12 @@ def test_few_bodies_and_none() -> None:
     assert abs(two["a"][0] - two["b"][0]) >= 1.0
 
 
-def test_resistance_distance_of_a_chain_adds_up_and_a_strong_link_is_short() -> None:
-    ends = np.array([[0, 1], [1, 2]])
-    d = resistance_distance(3, ends, np.array([100.0, 1.0]))
-    assert d[0, 1] < d[1, 2] < d[0, 2]
-    np.testing.assert_allclose(d, d.T)
+def test_a_strong_link_is_short_and_what_has_no_link_stands_apart() -> None:
+    at = places(["a", "b", "c", "d"], {("a", "b"): 100.0, ("b", "c"): 0.01, ("a", "d"): 0.01}, pitch=PITCH)
 
+    def apart(one: str, other: str) -> float:
+        return float(np.hypot(*np.subtract(at[one], at[other]) / PITCH))
 
-def test_distances_that_fit_a_plane_are_met() -> None:
-    xy = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0], [0.0, 4.0]])
-    distance = np.linalg.norm(xy[:, None] - xy[None], axis=-1)
-    flat = flattened(distance)
-    np.testing.assert_allclose(np.linalg.norm(flat[:, None] - flat[None], axis=-1), distance, atol=1e-3)
+    assert apart("a", "b") <= min(apart("b", "c"), apart("a", "d")) and apart("a", "b") < apart("c", "d")
+    alone = places(["a", "b", "c"], {("a", "b"): 1.0}, pitch=PITCH)
+    assert len(set(alone.values())) == 3
