@@ -166,7 +166,7 @@ def _diagnosis(
         worse = worsened(rows_as_given(on_all_rows(done.baseline, batches)), left_out_rows(written))
     if worse:
         remarks += (f"the machine file keeps its values and parts: the fitted ones raise {made.rises(worse, units)}",)
-    run = settling_run(named)
+    run, possible = settling_run(named), []
     separates = run.label if run is not None else ""
     found = []
     for r, left in pairs:
@@ -181,6 +181,7 @@ def _diagnosis(
     verdict = verdict_of(listed, len(listed) < len(found), rms, slow, final.runs)
     if run is None and verdict != "explained":
         run = revealing_run(done)
+        possible = [n for n in run.separates if n != NOTHING] if run is not None else []
     remarks += residual_remarks(slow, final.runs)
     last = done.rounds[-1]
     table = limits(last.before, last.screen, last.threshold)
@@ -193,7 +194,7 @@ def _diagnosis(
         rms,
         detection_limits,
         separates=run.label if run is not None else "",
-        possible=[n for n in run.separates if n != NOTHING] if run is not None else (),
+        possible=possible,
         places=[place_label(Where(n.where.kind, n.where.name), part_after) for n in detection_limits],
     )
     everything = made.empty_tables() | {

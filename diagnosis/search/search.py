@@ -55,8 +55,14 @@ def search(baseline: Fitted, workers: Processes | None = None, progress: Progres
 def _judged_together(
     baseline: Fitted, rounds: list[Round], workers: Processes, tell: Progress
 ) -> tuple[list[Round], Fitted]:
-    """The rounds, each with all other effects in its fit before, and the fit with those that are accepted."""
-    grown = [k for k, r in enumerate(rounds) if r.trust >= POLICY.grown_min_probability]
+    """The rounds, each with the other effects in its fit before, and the fit with those that are accepted.
+
+    What was grown after the last accepted effect neither is claimed nor has led to a claim: of that the first round
+    stays, which says what may be missing too.
+    """
+    last = max((k for k, r in enumerate(rounds) if r.accepted), default=-1)
+    rounds = rounds[: last + 2]
+    grown = [k for k, r in enumerate(rounds[: last + 1]) if r.trust >= POLICY.grown_min_probability]
     full = rounds[grown[-1]].best.fitted if grown else baseline  # type: ignore[union-attr]
     for k in grown[:-1]:
         try:

@@ -152,6 +152,18 @@ def test_an_explanation_that_structure_drawn_anew_does_not_bear_out_is_not_claim
     assert lost.confirmed and lost.gain == pytest.approx(0.0, abs=1e-6)
 
 
+def test_what_was_grown_after_the_last_claim_is_judged_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
+    r = found("drift").rounds[0]
+    assert r.best is not None and r.figures is not None
+    given = [replace(r, figures=replace(r.figures, relative_gain=g), resolved=frozenset()) for g in (0.2, 0.03, 1e-3)]
+    assert [g.accepted for g in given] == [True, False, False] and given[1].trust > POLICY.grown_min_probability
+    ahead = iter(given)
+    monkeypatch.setattr(search_module, "one_round", lambda *_, **__: next(ahead))
+    done = search_module.search(r.before)
+    assert len(done.rounds) == 2 and done.rounds[0] is given[0] and done.rounds[1] is given[1]
+    assert done.final is r.best.fitted
+
+
 def test_what_was_not_confirmed_is_not_claimed(monkeypatch: pytest.MonkeyPatch) -> None:
     """After the last confirmation the best confirmed one stays, whatever others promise."""
     r = found("drift").rounds[0]
