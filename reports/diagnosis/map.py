@@ -78,7 +78,7 @@ def mismatch_picture(view: Overview, found: pd.DataFrame, marks: Sequence[Mark])
     ]
     at = {m: _place(view, m) for m in marks}
     head = "; ".join(f"{m.label}: {m.name}" for m, place in at.items() if place is None) or _head(found)
-    title = f"What the simulation of {view.machine} leaves unexplained"
+    title = "What the simulation leaves unexplained"
     drawn = arranged(view, cards, [_legend(tints, found)], title, head, errors)
     for t, width_pt in link_widths_pt(view):
         drawn.line(t, BLUE if t in at.values() else tints.color("heat", t.name, _CALM_LINK), width_pt)

@@ -27,7 +27,7 @@ from twin.views.layout import places
 from twin.views.overview import ChainView, Overview, Tie
 
 LINK, EDGE, FILL, HEAT = "#8593a1", "#41566b", "#eef3f8", "#b84a00"
-NAME_PT, TEXT_PT, FOOT_PT = 10.0, 8.0, 8.5
+NAME_PT, TEXT_PT, FOOT_PT, TITLE_PT = 10.0, 8.0, 8.5, 14.0
 _LINE_IN, _FOOT_LINE_IN, _HEAD_IN, _MARGIN_IN = 0.155, 0.17, 0.75, 0.3
 _ASIDE_IN, _ABOVE_IN, _LEAST_IN = 0.55, 0.45, 9.0  # between cards; of the paper's width
 _MOST_HEATS, _MOST_LETTERS = 4, 26
@@ -147,7 +147,8 @@ def arranged(
     heavy = {b.name: b.capacity_J_per_K for b in view.bodies}
     at = places([c.name for c in cards], links, heavy, (wide + _ASIDE_IN, high + _ABOVE_IN))
     across, up = (max((p[i] for p in at.values()), default=0.0) for i in (0, 1))
-    width = max(across + wide + 2 * _MARGIN_IN, _LEAST_IN)
+    titled = _width_in(f"{title}   SIMULATED", TITLE_PT, True)
+    width = max(max(across + wide, titled) + 2 * _MARGIN_IN, _LEAST_IN)
     foot = [line for text in foot for line in textwrap.wrap(text, round(15 * (width - 2 * _MARGIN_IN)))]
     foot_in = _FOOT_LINE_IN * len(foot) + 0.25
     low = foot_in + (0.8 if below else 0.0)
@@ -162,7 +163,7 @@ def arranged(
     ax.plot([_MARGIN_IN, width - _MARGIN_IN], [foot_in] * 2, color="#d5dbe1", lw=0.8)
     for k, text in enumerate(foot):
         say(ax, _MARGIN_IN, foot_in - 0.15 - _FOOT_LINE_IN * k, text, FOOT_PT, MUTED, ha="left")
-    say(ax, _MARGIN_IN, height - 0.27, title, 14, ha="left", bold=True)
+    say(ax, _MARGIN_IN, height - 0.27, title, TITLE_PT, ha="left", bold=True)
     say(ax, _MARGIN_IN, height - 0.52, under, 9, MUTED, ha="left")
     if view.simulated:
         say(ax, width - _MARGIN_IN, height - 0.27, "SIMULATED", 12, ORANGE, ha="right", bold=True)

@@ -56,6 +56,14 @@ def test_every_body_link_surrounding_sensor_and_law_is_in_the_picture(view: Over
     assert "14 bodies, 16 links, 17 exposures, 9 sensors; 60 free and 81 fixed parameters" in said
 
 
+def test_a_long_name_of_a_machine_leaves_room_for_the_mark_of_what_is_simulated(view: Overview) -> None:
+    figure = network_picture(replace(view, machine="machining_centre_with_a_long_name_" * 3, simulated=True))
+    figure.canvas.draw()
+    said = {t.get_text(): t.get_window_extent() for t in figure.axes[0].texts}
+    title = next(box for text, box in said.items() if text.startswith("Thermal network of"))
+    assert title.x1 < said["SIMULATED"].x0
+
+
 def test_chains_are_told_with_sign_and_closure(view: Overview) -> None:
     z, y, _ = (chain_label(c) for c in view.chains)
     assert z.startswith("z: + ") and "− column_back 0.625 m, closes" in z
