@@ -3,6 +3,7 @@
     python -m benchmarks.kinds --kinds lathe board --cases 12 --out var/kinds
     python -m benchmarks.kinds --paired 870000 --table results/diagnosis_kinds.csv
     python -m benchmarks.kinds --paired 700000 --claims results/claims.csv
+    python -m benchmarks.kinds --withheld ../shared/data --table results/diagnosis_withheld.csv
 
 Draws cases of the proof for every kind (nothing missing, one effect or two, one of no list), diagnoses each, and prints
 by kind: effects named (of those that are visible at all, and of all), claims and how many of them are true, false
@@ -11,7 +12,8 @@ finding, or an explanation that these recordings cannot distinguish from it, has
 are done are not done again; `--workers` side by side. `--paired` takes of every kind ten cases with one effect of at
 least `--noises` times its noise, seven with none and three with two, by seeds from the number given; `--table` stores a
 row for each. `--claims` stores the likeliest claim of the first round of each instead, and prints the offset and weight
-of a claim's probability (`POLICY.claim_offset`) that are fitted to them. The proof (`thermodrift prove --plants …`)
+of a claim's probability (`POLICY.claim_offset`) that are fitted to them. `--withheld` takes real recordings whose
+machine file lacks what it is known to need. The proof (`thermodrift prove --plants …`)
 asks the same under seal, with baselines.
 """
 
@@ -20,7 +22,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -47,6 +49,7 @@ from diagnosis.search.search import one_round
 from evidence.scoring.answer_key import AnswerKey, Spot
 from evidence.scoring.matching import names_term
 from thermodrift_exam.plants.plant import Case
+from thermodrift_exam.plants.withheld import CASES, build, cases
 from thermodrift_exam.proof.scoring.true_model import TrueModel, true_model
 from thermodrift_exam.proof.spec import KIND_PLANTS, CaseSpec, Kind, PlantKind
 from thermodrift_exam.proof.suite.build import answer_of
@@ -73,23 +76,37 @@ def examined(
     if path.exists():
         return dict(json.loads(path.read_text()))
     spec, case = _drawn(kind, seed, paired, noises)
-    answer = answer_of(spec, case)
-    key, what = AnswerKey.from_json(answer), spec.kind
-    begun = time.process_time()
-    row: dict[str, Any] = {"kind": kind, "seed": spec.seed if paired else seed, "what": what}
-    row["terms"] = case.truth["terms"]
+    row = {"kind": kind, "seed": spec.seed if paired else seed, "what": spec.kind, "terms": case.truth["terms"]}
+    return _diagnosed(path, row, case.machine, case.batches, answer_of(spec, case), proposed)
+
+
+def of_withheld(name: str, data: str, out: str) -> dict[str, Any]:
+    """A case of real recordings whose machine file lacks what it is known to need, as a row of `examined`."""
+    path = Path(out) / f"{name}.json"
+    if path.exists():
+        return dict(json.loads(path.read_text()))
+    case, about = build(name, Path(data), seed=1), CASES[name]
+    row = {"kind": about.machine, "seed": name, "what": about.kind, "terms": case.answer["terms"]}
+    return _diagnosed(path, row, case.machine, case.batches, case.answer)
+
+
+def _diagnosed(
+    path: Path, row: dict[str, Any], machine: Machine, given: Sequence[Batch], answer: Mapping[str, Any],
+    proposed: int = 0,
+) -> dict[str, Any]:  # fmt: skip
+    """The row with the diagnosis of a case and its judgement, kept in a file."""
+    key, begun = AnswerKey.from_json(answer), time.process_time()
     try:
         with threadpool_limits(limits=1):
-            part = twin_part(case.machine)
-            batches, _ = usable_batches(compile_network(case.machine, part=part), case.batches)
-            done = diagnose(case.machine, batches)
-            row |= _answered(done, key, part)
+            part, batches = (twin_part(machine) if machine.twin is not None else None), list(given)
+            if part is not None:
+                batches, _ = usable_batches(compile_network(machine, part=part), batches)
+            done = diagnose(machine, batches)
+            row |= _answered(done, key, part or done.part_before)
             row["cpu_s"] = round(time.process_time() - begun, 1)
-            row["proposed"] = list(_proposed(done, case.machine, batches, answer["redraw"], key, proposed))
-            if what in ("one", "two"):
-                row |= _visible(
-                    true_model(case.machine, batches, answer, done.search.baseline if done.search else None)
-                )
+            row["proposed"] = list(_proposed(done, machine, batches, answer["redraw"], key, proposed))
+            if row["what"] in ("one", "two"):
+                row |= _visible(true_model(machine, batches, answer, done.search.baseline if done.search else None))
     except (InputError, WorkError) as error:
         row["trouble"] = str(error)
     path.write_text(json.dumps(row, default=float))
@@ -311,11 +328,18 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first case")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--proposed", type=int, default=0, help="proposed runs that are executed after the answer")
+    parser.add_argument("--withheld", type=Path, help="folder of real recordings; their cases instead of drawn ones")
+    parser.add_argument("--machines", nargs="+", default=["tclab_board", "cell_30q"], help="of --withheld")
     parser.add_argument("--out", type=Path, default=Path("var/kinds"))
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     tasks: list[tuple[Any, ...]] = []
-    if given.paired is not None:
+    work: Callable[..., dict[str, Any]] = first_round if given.claims else examined
+    if given.withheld is not None:
+        work = of_withheld
+        names = [n for n in cases(given.withheld) if CASES[n].machine in given.machines]
+        tasks += [(name, str(given.withheld), str(given.out)) for name in names]
+    elif given.paired is not None:
         proposed = () if given.claims else (0,)
         every = pairs(given.kinds or KIND_PLANTS, given.paired)
         tasks += [(kind, seed, str(given.out), *proposed, what, given.noises) for kind, seed, what in every]
@@ -324,14 +348,17 @@ def main() -> None:
         tasks += [(kind, seed, str(given.out), given.proposed) for seed in seeds for kind in kinds]
     rows = []
     with Processes(given.workers) as pool:
-        for k, row in pool.completed(first_round if given.claims else examined, tasks):
+        for k, row in pool.completed(work, tasks):
             rows.append(row)
             effect = "+".join(f"{t['effect']} {t.get('sigma', 0):.1f}" for t in row["terms"]) or row["what"]
             first = row["rounds"][0]["tried"][:1] if given.claims else row.get("listed", ())
             said = next((claim["name"] for claim in first), row.get("trouble", "no claim"))
             print(f"{tasks[k][0]:<10} {effect:<28} {said[:60]}  {row.get('cpu_s', 0):.0f} s", flush=True)
     if given.table:
-        write(given.table, as_rows(rows), f"python -m benchmarks.kinds --paired {given.paired} --table {given.table}")
+        of = f"--paired {given.paired}"
+        if given.withheld is not None:
+            of = f"--withheld {given.withheld} --machines {' '.join(given.machines)}"
+        write(given.table, as_rows(rows), f"python -m benchmarks.kinds {of} --table {given.table}")
     if given.claims:
         stored = claims(rows)
         write(given.claims, stored, f"python -m benchmarks.kinds --paired {given.paired} --claims {given.claims}")
