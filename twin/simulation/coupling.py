@@ -197,9 +197,8 @@ class _Solver:
     def _heat_W(self, part: slice, chord: Chord) -> Array:
         """The sources' heat on the present trajectory, plus what the chord takes out, (P, k, B, m, 2)."""
         out = self.series[:, :, :, part]
-        with np.errstate(over="ignore", invalid="ignore"):
-            for k, source in enumerate(self.sources):
-                out[:, k] = np.moveaxis(source.watts(self.borders, part), -2, -1)
+        for k, source in enumerate(self.sources):
+            out[:, k] = np.moveaxis(source.watts(self.borders, part), -2, -1)
         if chord.used:
             own = np.moveaxis(self.seen[len(self.rows) :, ..., part.start : part.stop + 1], 0, 1)
             slope = np.moveaxis(chord.slope_W_per_K[:, self.balance.regimes.of[:, part]], -1, 1)[..., None]
@@ -227,8 +226,7 @@ class _Solver:
         direction = source.direction
         size = (direction**2).sum(axis=-1)
         sample = slice(part.start, part.stop, max((part.stop - part.start) // SAMPLED, 1))
-        with np.errstate(over="ignore", invalid="ignore"):
-            slopes = source.slopes(self.borders, sample)
+        slopes = source.slopes(self.borders, sample)
         of, valid = balance.regimes.of[:, sample], balance.inputs.valid[:, sample]
         fall = np.zeros((len(direction), *valid.shape))
         for place, slope in slopes.items():

@@ -38,6 +38,7 @@ class Solved:
     asleep: Sequence[HeatSource] = ()  # heat of candidates, which does not count
 
 
+@np.errstate(over="ignore", invalid="ignore")  # at values that no machine has; what is not finite is refused
 def solved_balance(
     network: Network, values: Array, inputs: Inputs, start_degC: Array, tolerance_K: float, every: int = 1
 ) -> Solved:
