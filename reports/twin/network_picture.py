@@ -193,8 +193,8 @@ def say(
     ax: Axes, x: float, y: float, text: str, size_pt: float = TEXT_PT, color: str = INK, ha: str = "center",
     bold: bool = False, halo: bool = False,
 ) -> None:  # fmt: skip
-    """Text; a halo keeps it readable over lines. $ is only itself."""
-    shown = ax.text(x, y, tex_escaped(text), fontsize=size_pt, color=color, ha=ha, va="center", zorder=6)
+    """Text; a halo keeps it readable over lines, behind cards. $ is only itself."""
+    shown = ax.text(x, y, tex_escaped(text), fontsize=size_pt, color=color, ha=ha, va="center", zorder=3 if halo else 6)
     shown.set_fontweight("bold" if bold else "normal")
     if halo:
         shown.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
