@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,47 +92,69 @@ def _level(batch: Batch, name: str, at_end: bool) -> float:
 
 
 _AT = (0.1, 0.25, 0.5, 1.0)  # of the batch's length
+_LEAST_SPREAD = (0.3, *[0.04] * len(_AT))  # of a temperature's fingerprint: K, and shares of the typical rise
+_SHARES = (0.05, 0.5, 0.95)
 _MISFIT = 4.0
 _FIT = 2.5
 
 
 class Swapped(Check):
-    """Each sensor has a fingerprint: start level and rises at four times, against the median of all sensors.
+    """Each temperature has a fingerprint: start level and rises at four times, against the median of all sensors; each
+    driver the values that it is below in a twentieth, a half and nineteen twentieths of the rows.
 
-    Two sensors are swapped in a batch where neither fits its own fingerprint of the other batches (4 robust
+    Two channels are swapped in a batch where neither fits its own fingerprint of the other batches (4 robust
     sigma rms) and each fits the other's (2.5 sigma).
     """
 
     key = "swapped"
-    summary = "two sensors have changed places"
+    summary = "two channels have changed places"
 
     def across(self, batches: Sequence[Batch], machine: Machine) -> dict[int, list[Finding]]:
-        names = list(batches[0].names(*THERMAL)) if batches else []
-        if len(batches) < _BATCHES or len(names) < 3:
-            return {}
-        prints = np.array([_fingerprints(b, names) for b in batches])  # (K, p, f)
         found: dict[int, list[Finding]] = {}
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # a channel that no batch has is all NaN
-            centre = np.nanmedian(prints, axis=0)
-            spread = 1.4826 * np.nanmedian(np.abs(prints - centre), axis=0)
-        floor = np.array([0.3] + [0.04] * len(_AT))
-        spread = np.maximum(spread, floor)
-        for k in range(len(batches)):
-            # fit[i, j]: rms deviation of channel i from the fingerprint of channel j
-            z = (prints[k][:, None, :] - centre[None]) / spread[None]
-            fit = np.sqrt(np.mean(np.minimum(np.abs(z), 30.0) ** 2, axis=2))
-            bad = [i for i in range(len(names)) if np.isfinite(fit[i, i]) and fit[i, i] > _MISFIT]
-            for a, i in enumerate(bad):
-                for j in bad[a + 1 :]:
-                    if fit[i, j] < _FIT and fit[j, i] < _FIT:
-                        for this, other in ((i, j), (j, i)):
-                            message = (
-                                f"{names[this]} behaves as {names[other]} does in the other batches and the other way "
-                                "round: their plugs or columns have changed places"
-                            )
-                            found.setdefault(k, []).append(self.finding(names[this], message))
+        if len(batches) < _BATCHES:
+            return found
+        thermal, drivers = list(batches[0].names(*THERMAL)), list(batches[0].names("driver"))
+        for names, least, prints_of in ((thermal, 3, _fingerprints), (drivers, 2, _levels)):
+            if len(names) < least:
+                continue
+            prints = np.array([prints_of(b, names) for b in batches])  # (K, p, f)
+            for k, i, j in _swaps(prints, np.array(_LEAST_SPREAD) if names is thermal else _of_range(prints)):
+                message = (
+                    f"{names[i]} behaves as {names[j]} does in the other batches and the other way round: their plugs "
+                    "or columns have changed places"
+                )
+                found.setdefault(k, []).append(self.finding(names[i], message))
         return found
+
+
+def _swaps(prints: Array, floor: Array) -> Iterator[tuple[int, int, int]]:
+    """Batch and both channels, in either order, of each swap in fingerprints (K, p, f) of spread `floor` at least."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a channel that no batch has is all NaN
+        centre = np.nanmedian(prints, axis=0)
+        spread = np.maximum(1.4826 * np.nanmedian(np.abs(prints - centre), axis=0), floor)
+    for k, own in enumerate(prints):
+        # fit[i, j]: rms deviation of channel i from the fingerprint of channel j
+        z = (own[:, None, :] - centre[None]) / spread[None]
+        fit = np.sqrt(np.mean(np.minimum(np.abs(z), 30.0) ** 2, axis=2))
+        bad = [i for i in range(len(own)) if np.isfinite(fit[i, i]) and fit[i, i] > _MISFIT]
+        for i, j in combinations(bad, 2):
+            if fit[i, j] < _FIT and fit[j, i] < _FIT:
+                yield from ((k, i, j), (k, j, i))
+
+
+def _levels(batch: Batch, names: list[str]) -> Array:
+    """The values that each driver is below in 5, 50 and 95 % of the rows, (p, 3)."""
+    own = [batch.masked(n) if n in batch.channels else np.full(1, np.nan) for n in names]
+    return np.array([np.quantile(v[np.isfinite(v)], _SHARES) if np.isfinite(v).any() else [np.nan] * 3 for v in own])
+
+
+def _of_range(prints: Array) -> Array:
+    """A twentieth of the range of each channel's levels over all batches, (p, 1)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        typical = np.nanmedian(prints, axis=0)
+    return np.asarray(0.05 * np.maximum(np.ptp(typical, axis=1), np.abs(typical).max(axis=1) * 0.1)[:, None] + 1e-12)
 
 
 def _fingerprints(batch: Batch, names: list[str]) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from data.batch import Batch, Finding
+from data.batch import Batch, Channel, Finding
 from data.checks import CHECKS, check_batch, check_machine, checked, usable_channels, why_missing
 from data.checks.across_batches import Copied
 from data.errors import InputError
@@ -250,6 +250,25 @@ ODD: dict[str, tuple[int, Callable[[Batch], Batch], list[tuple[str, str | None, 
         [("short", None, False)], "lasts 2 h 00 min, the median run 8 h 00 min",
     ),
 }  # fmt: skip
+
+
+def cell_run(seed: int, exchanged: bool = False) -> Batch:
+    """A cell that is discharged in steps of another order in each run."""
+    rng, base = np.random.default_rng(seed), toy_batch(seed)
+    current = -np.repeat(rng.permutation([0.0, 1.0, 2.0, 5.0, 0.0, 3.0]), 20)[: base.n_rows]
+    current = np.pad(current, (0, base.n_rows - len(current)))
+    voltage = 4.1 + 0.05 * current - 0.6 * np.linspace(0.0, 1.0, base.n_rows)
+    series = {"current": voltage, "voltage": current} if exchanged else {"current": current, "voltage": voltage}
+    drivers = {n: Channel(n, "driver", unit) for n, unit in (("current", "A"), ("voltage", "V"))}
+    return replace(base, table=base.table.assign(**series), channels={**base.channels, **drivers})
+
+
+def test_two_drivers_that_changed_places_in_one_run() -> None:
+    runs = [cell_run(seed, exchanged=seed == 3) for seed in range(6)]
+    found = CHECKS["swapped"]().across(runs, toy_machine())
+    assert [(k, [f.channel for f in own]) for k, own in found.items()] == [(3, ["current", "voltage"])]
+    assert "current behaves as voltage does in the other batches" in found[3][0].message
+    assert not CHECKS["swapped"]().across([cell_run(seed) for seed in range(6)], toy_machine())
 
 
 @pytest.mark.parametrize("what", ODD)
