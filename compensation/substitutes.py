@@ -52,6 +52,7 @@ _MOST_OFF = 2  # channels at once, as two exchanged plugs; what more of them do 
 _MOST_KNOWN = 2000  # regressions kept: all pairs of sixty channels
 _SAME_K = 1e-9  # equal but for rounding: a frozen value is repeated exactly
 _FARTHEST_K = 1e4  # no machine is hotter; bounds channels without a range
+_KEPT = ("filled", "used_s", "agreed", "same", "same_s", "moved_K")  # arrays of a `Watch` that a restart needs
 
 
 @dataclass(frozen=True)
@@ -276,7 +277,8 @@ class Watch:
     Attributes:
         status: of each channel.
         filled: value returned last, measured or substituted.
-        raw: value that arrived last, NaN where it was lost or implausible.
+        raw: value that arrived last, NaN where it was lost or implausible; unknown after a restart, since time stamps
+            alone say how long that took.
         used_s: how long each channel has been replaced, s.
         agreed: consecutive samples for which a failed channel has been consistent.
         same: value that the channel has kept, `same_s` how long, s, and `moved_K` what the regression predicts for
@@ -302,29 +304,21 @@ class Watch:
 
     def as_plain(self) -> dict[str, Any]:
         """Numbers, strings and lists; None where a value is not known."""
-        arrays = {
-            name: [None if np.isnan(v) else v for v in getattr(self, name).tolist()]
-            for name in self.__dataclass_fields__
-            if name not in ("status", "time_s", "levels")
-        }
+        arrays = {name: [None if np.isnan(v) else v for v in getattr(self, name).tolist()] for name in _KEPT}
         return {"status": list(self.status), "time_s": self.time_s, "levels": self.levels, **arrays}
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> Self:
         """The inverse of `as_plain`. Raises: InputError, an unknown status or arrays of different lengths."""
         status = tuple(one_of(str(s), STATUSES, "status of a channel") for s in plain["status"])
-        arrays = {
-            name: np.array([np.nan if v is None else float(v) for v in plain[name]])
-            for name in cls.__dataclass_fields__
-            if name not in ("status", "time_s", "levels")
-        }
+        arrays = {name: np.array([np.nan if v is None else float(v) for v in plain[name]]) for name in _KEPT}
         if lengths := {name: len(a) for name, a in arrays.items() if len(a) != len(status)}:
             raise InputError(
                 f"state of a guard: got {lengths}, expected {len(status)} values, one for every status; delete the "
                 "stored state, the guard then starts afresh"
             )
         time_s = None if plain["time_s"] is None else float(plain["time_s"])
-        return cls(status, time_s=time_s, levels=bool(plain["levels"]), **arrays)
+        return cls(status, raw=np.full(len(status), np.nan), time_s=time_s, levels=bool(plain["levels"]), **arrays)
 
 
 @dataclass(frozen=True)
@@ -363,6 +357,9 @@ class Guard:
     substitute. Where the substitute itself cannot be trusted any more, because its time is spent or more than half of
     the channels failed together, a lost or implausible channel is taken again on its rate alone. A channel that steps
     or freezes then needs to agree nevertheless, or a fresh start by `begin`.
+
+    A start, at first and after a long pause, rests on levels alone and ends with the first sample that can be used. The
+    first sample after a restart is not judged by its rate where the regressions explain all channels.
     """
 
     def __init__(self, substitutes: Substitutes, limits: GuardLimits | None = None) -> None:
@@ -405,9 +402,12 @@ class Guard:
         fresh = present & np.isnan(before)
         status[~present & ~watch.bad] = "implausible"
         status[np.isnan(x) & ~watch.bad] = "lost"
-        usual_K = s.usual_K(dt_s)
+        usual_K, any_K = s.usual_K(dt_s), np.full(len(s.names), np.inf)
         good = present & ~watch.bad & ~fresh
-        good, (weights, sd_K, _) = self._without_steps(good, np.where(good, x - before, 0.0), usual_K)
+        change_K = np.where(good, x - before, 0.0)
+        if np.isnan(watch.raw).all() and (self._without_steps(good, change_K, any_K)[0] == good).all():
+            usual_K = any_K
+        good, (weights, sd_K, _) = self._without_steps(good, change_K, usual_K)
         status[present & ~watch.bad & ~fresh & ~good] = "stepping"
         predicted_K = weights @ np.where(good, x - before, 0.0)
 
@@ -417,7 +417,6 @@ class Guard:
         frozen = same & (same_s > HELD_MARGIN * np.maximum(s.held_s, s.step_s))
         frozen &= np.abs(moved_K) > limits.frozen_sd * sd_K + s.resolution_K
         status[frozen] = "frozen"
-        status[fresh] = "ok"
         was_off = status == "off"
         compared = (good & ~frozen) | fresh | (was_off & present)
         agree, level, level_sd_K = self._without_off(compared, x, watch)
@@ -442,7 +441,8 @@ class Guard:
             same=np.where(kept, watch.same, filled), same_s=same_s, moved_K=moved_K,
             time_s=float(time_s) if np.isfinite(time_s) else watch.time_s,
         )  # fmt: skip
-        return after, self._checked(after, values, np.where(off | begun, level_sd_K, sd_K))
+        checked = self._checked(after, values, np.where(off | begun, level_sd_K, sd_K))
+        return self.begin(watch.levels) if checked.fault and np.isnan(before).all() else after, checked
 
     def _without_steps(self, good: Mask, change_K: Array, usual_K: Array) -> tuple[Mask, Regression]:
         """Good channels that do not step, with the regression on them."""

@@ -195,9 +195,8 @@ class Stream:
         still_s = self.now_s - self.moved_s
         must, limits = self.control.must, self.line.machine.axes[0].limits
         must(abs(um) <= limits.max_offset_um, "size sent", f"{um} µm")
-        must(
-            state != "active" or still_s <= limits.stale_s + PERIOD_S, "stands still", f"active, still for {still_s} s"
-        )
+        most_s = 2.0 * limits.stale_s + PERIOD_S  # of the delay of the last sample, of silence since, and of the grid
+        must(state != "active" or still_s <= most_s, "stands still", f"active, still for {still_s} s")
         must(state != "active" or not self.stopped, "stopped", "active after the operator stopped it")
         self.active += state == "active"
         passed_s, self.got_s = self.now_s - self.got_s, self.now_s

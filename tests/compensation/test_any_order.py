@@ -80,7 +80,8 @@ class NextToTheControl(RuleBasedStateMachine):
             ahead_s = grid_s - self.since[0] - (self.now_s - self.since[1])
             assert ahead_s <= self.slack_s + LIMITS.stale_s, "the model is ahead of time"
         if correction.state["z"] == "active":
-            assert self.now_s - self.moved_s <= LIMITS.stale_s + PERIOD_S, "active, and the model stands still"
+            most_s = 2.0 * LIMITS.stale_s + PERIOD_S  # delay of the last sample, silence since, and the grid
+            assert self.now_s - self.moved_s <= most_s, "active, and the model stands still"
             assert not self.stopped
 
     def sampled(self, off_s: float = 0.0) -> Correction:

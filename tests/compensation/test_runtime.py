@@ -226,6 +226,22 @@ def test_a_repeated_sample_is_silence() -> None:
     assert states == ["active"] * 4 + ["hold"]
 
 
+@pytest.mark.parametrize(("late_s", "states"), [(390.0, ["active"] * 5 + ["hold"]), (410.0, ["hold"] * 6)])
+def test_an_active_axis_rests_on_a_sample_that_is_at_most_twice_as_old_as_a_fault(
+    late_s: float, states: list[str]
+) -> None:
+    *train, left = make_toy_batches(8, 60)
+    machine = Compensator(
+        "toy", [model_of(train, limits=replace(QUICK, stale_s=400.0, hold_s=1e4))], period_s=left.step_s
+    )
+    given = samples(left)
+    run(machine, given[:20])
+    arrives_s = given[23].time_s - 1e9
+    done = [machine.take(replace(given[23], time_s=given[23].time_s - late_s), arrives_s)]
+    done += [machine.silence(arrives_s + 100.0 * k, 1e9 + arrives_s + 100.0 * k) for k in range(1, 6)]
+    assert [c.state["z"] for c in done] == states
+
+
 def test_a_restart_with_a_clock_that_was_set_back_begins_a_new_run() -> None:
     """The saved state is from the future then: without a new run the models would wait for it, as if all were well."""
     *train, left = make_toy_batches(8, 60)

@@ -286,6 +286,48 @@ def test_a_restart_changes_nothing(guard: Guard, batches: list[Batch]) -> None:
     assert run(guard, batches[-1], changes) == run(guard, batches[-1], changes, restart_at=18)
 
 
+@pytest.mark.parametrize(
+    ("wrong", "found"),
+    [
+        ({}, set()),
+        ({"t0": "t4", "t4": "t0"}, {"t0", "t4"}),
+        ({"t1": 15.0}, {"t1"}),
+        (dict.fromkeys(NAMES, 15.0), set(NAMES)),
+    ],
+)
+def test_the_first_sample_after_a_restart_may_come_later_than_its_stamp_says(
+    guard: Guard, batches: list[Batch], wrong: Mapping[str, str | float], found: set[str]
+) -> None:
+    """A clock that is set back while the machine warms up unseen: what the sensors show together decides."""
+    rows = [{n: float(batches[-1].values(n)[i]) for n in NAMES} for i in range(40)]
+    watch, at_s = guard.begin(), 2 * STEP_S + 10.0
+    for i in range(3):
+        watch, _ = guard.step(watch, i * STEP_S, rows[i])
+    later = {n: rows[20][w] if isinstance(w := wrong.get(n, 0.0), str) else rows[20][n] + w for n in NAMES}
+    _, running = guard.step(watch, at_s, later)
+    assert running.status["t0"] == "stepping", "while it runs the clock of the computer says how much time has passed"
+    watch, checked = guard.step(Watch.from_plain(watch.as_plain()), at_s, later)
+    assert {n for n, s in checked.status.items() if s != "ok"} >= found
+    for i in () if wrong else range(21, 40):
+        assert (checked.fault, {n: checked.values[n] for n in NAMES}) == (None, later)
+        later = rows[i]
+        watch, checked = guard.step(watch, at_s + (i - 20) * STEP_S, later)
+
+
+@pytest.mark.parametrize("room", [1.0, -10.0, 50.0])
+def test_a_sample_that_cannot_be_used_is_no_reference_for_those_that_follow(
+    guard: Guard, batches: list[Batch], room: float
+) -> None:
+    """Two sensors that contradict each other do not say which one is wrong, and the others came later."""
+    for first in ({"room": room}, {"room": room, "t4": float(batches[-1].values("t4")[0])}):
+        watch, checked = guard.step(guard.begin(), 0.0, first)
+        assert checked.fault and "t0 lost: never arrived" in checked.fault
+        for i in range(1, 10):
+            given = {n: float(batches[-1].values(n)[i]) for n in NAMES}
+            watch, checked = guard.step(watch, i * STEP_S, given)
+            assert (checked.fault, checked.values) == (None, given)
+
+
 def test_after_a_long_pause_the_guard_starts_afresh(guard: Guard) -> None:
     watch, _ = guard.step(guard.begin(), 0.0, dict.fromkeys(NAMES, 20.0))
     watch, checked = guard.step(watch, 300.0, {**dict.fromkeys(NAMES, 20.0), "t1": 28.0})
@@ -313,7 +355,7 @@ def test_a_state_of_other_channels_is_refused(guard: Guard, batches: list[Batch]
     with pytest.raises(InputError, match="got 2 channels, expected 6"):
         guard.step(other, 0.0, {})
     with pytest.raises(InputError, match="expected 2 values"):
-        Watch.from_plain({**other.as_plain(), "raw": [1.0]})
+        Watch.from_plain({**other.as_plain(), "filled": [1.0]})
 
 
 VALUE = st.one_of(st.floats(15.0, 40.0), st.sampled_from([nan, inf, -inf, 1e300, 20.0]), st.floats())
