@@ -20,8 +20,13 @@ from data.machine import parse_machine
 from features.design import Design
 from features.rises import zeroed_error_um
 from models.base import Family
+from models.families import FAMILIES
+from models.protocols import PromotionRule
 from models.selection.conformal import RunBound
 from models.selection.crossing import unfitted, with_target
+from models.selection.loss import BASELINES
+from models.selection.promotion import KEYS, Choice, Losses, pick
+from models.selection.result import GridResult
 from models.selection.trust import Region
 from models.selection.updating import Updater, left_out_tracks, out_of_fold
 from pipelines.store import model_store
@@ -149,3 +154,34 @@ def faults_of(family: Family, batches: Sequence[Batch], substitutes: Substitutes
         return None
     run = max(_ordered(batches), key=lambda b: largest[b.batch_id])
     return fault_cost(family.predict_batches, substitutes, run, ROOM * most_um)
+
+
+def spared(
+    faults: FaultCost, choice: Choice, result: GridResult, rule: PromotionRule, machine_yaml: str,
+    batches: Sequence[Batch],
+) -> str:  # fmt: skip
+    """What the best judged model costs in S that the dearest fault cannot reach, since it lacks a sensor of it, and
+    what its own dearest fault costs; empty where no fault matters."""
+    sensors = {name for name in faults.um_per_K if name in faults.worst.partition(": ")[0].split(" and ")}
+    led = rule.only(choice.protocol)  # by one protocol more cells than the finalists are judged
+    losses = Losses.of(result, led)
+    lacks = [
+        sensors - {i.partition("@")[0] for i in inputs.split("|")} if _runs_alone(family) else set()
+        for inputs, family in zip(losses.cells["inputs"], losses.cells["family"], strict=True)
+    ]
+    if not any(lacks):
+        return f"every model that was judged reads {' and '.join(sorted(sensors))}" if sensors else ""
+    labels = ["|".join(map(str, key)) for key in losses.cells[KEYS].itertuples(index=False)]
+    behind_um, se_um = losses.behind(labels.index(choice.cell), losses.counted())
+    at = int(np.argmin(np.where([bool(names) for names in lacks], behind_um, np.inf)))
+    other, machine = pick(result, led, labels[at]), parse_machine(machine_yaml, "machine.yml")
+    known = with_target(batches, result.target)
+    family = unfitted(other.family).fit(known, other.inputs, result.target, machine)
+    cost = faults_of(family, batches, guarded(family, batches))
+    left = "" if cost is None else f", and its dearest fault costs {cost.worst_um:.3g} µm"
+    named = " and ".join(sorted(lacks[at]))
+    return f"without {named}, {other.name} leaves {behind_um[at]:.2g} ± {se_um[at]:.2g} µm more{left}"
+
+
+def _runs_alone(family: str) -> bool:
+    return family not in BASELINES and not FAMILIES[family].combines and FAMILIES[family].has_program()

@@ -35,6 +35,7 @@ from data.errors import InputError, closest, one_of
 from features.rises import zeroed_error_um
 from models.base import Family
 from models.metrics import residual_std_um
+from models.protocols import PromotionRule
 from models.selection.conformal import RunBound
 from models.selection.outlook import Outlook, outlook
 from models.selection.promotion import Choice, Comparison, compare_paired, left_out
@@ -275,8 +276,16 @@ def _register(
         choice.cell, choice.caution, f"{name} version {version} is {outcome}: {why}; {choice.summary}", comparison,
         None if champion is None else int(champion.version), obstacle, force, choice.nested_S_mean_um,
         choice.nested_S_std_um, new.outlook, choice.standing, choice.authority,
-        "" if faults is None else faults.summary,
+        _said(new, settings.promotion),
     )  # fmt: skip
+
+
+def _said(new: Newcomer, rule: PromotionRule) -> str:
+    """What failing sensors cost, and what doing without the dearest of them costs."""
+    if new.faults is None:
+        return ""
+    spared = fitted_model.spared(new.faults, new.choice, new.result, rule, new.machine_yaml, new.batches)
+    return "; ".join(filter(None, (new.faults.summary, spared)))
 
 
 def _info(new: Newcomer) -> dict[str, Any]:

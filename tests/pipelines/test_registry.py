@@ -420,11 +420,35 @@ def test_a_model_that_a_failed_sensor_can_ruin_is_no_champion_where_a_budget_say
     assert (refused.outcome, refused.champion_version) == ("challenger", None)
     assert "a fault of a sensor costs 55 µm (front: a drift of 1 K/h), more than fault_budget_um" in refused.summary
     taken = train(within, "toy-dear", [5.0, 6.0] * 3 + [5.0])
-    assert taken.outcome == "champion" and taken.faults == cost.summary
+    assert taken.outcome == "champion" and taken.faults == f"{cost.summary}; every model that was judged reads front"
     tags = MlflowClient(store.store_uri, registry_uri=store.store_uri).get_model_version("toy-dear-z", "2").tags
     assert tags["worst_fault"] == "front: a drift of 1 K/h" and tags["worst_fault_um"] == "55.0"
     assert tags["sensor_um_per_K"] == '{"front": 9.0, "bed": 2.0}'
     assert load_model("models:/toy-dear-z@champion", store).info["faults"]["missed"] == 3
+
+
+def test_what_a_model_without_the_sensor_of_the_dearest_fault_costs_and_saves_is_stated(store):
+    """A model of the front alone cannot have its sensor exchanged with that of the bed."""
+    batches = toy_batches("toy-spared", 6)
+    more_um = np.array([0.2, 0.9, 0.4, 0.1, 0.6, 0.2])
+    result = toy_result(batches, {
+        "none|zero|0": [50.0] * 6, "none|mlr|2": [1.0, 2.0] * 3, "fcgc|mlr|1": more_um + [1.0, 2.0] * 3,
+        "fcgc|ridge|1": [9.0] * 6,
+    })  # fmt: skip
+    choice, (both, region) = replace(choose(result, store.promotion), authority=1.0), toy_model(batches)
+    assert choice.cell == "none|mlr|2"
+    new = registry.Newcomer(
+        result, choice, both, machine_yaml("toy-spared"), log_training(result, store), region, batches
+    )
+    assert new.faults is not None and new.faults.worst == "bed and front: exchanged"
+    alone = FAMILIES["mlr"]().fit(batches, ("front",), "z")
+    cost = registry.fitted_model.faults_of(alone, batches, registry.fitted_model.guarded(alone, batches))
+    said = registry.promote(new, store).faults
+    assert said.startswith(new.faults.summary)
+    assert said.endswith(
+        f"; without bed, mlr on 1 point by fcgc leaves {more_um.mean():.2g} ± {more_um.std(ddof=1) / 6**0.5:.2g} µm "
+        f"more, and its dearest fault costs {cost.worst_um:.3g} µm"
+    )
 
 
 def test_a_model_states_the_range_of_a_package_of_an_extra_that_is_not_installed(monkeypatch):
