@@ -212,7 +212,7 @@ class Bucket:
             raise InputError(f"lake {self.name}: obstore is not installed; run {_INSTALL}") from None
         except Exception as error:  # obstore's own, of no common class with a meaning
             raise InputError(
-                f"lake {self.name}: no place that obstore knows ({masked(_first_line(error))}); expected a folder or "
+                f"lake {self.name}: no place that obstore knows ({_first_line(error)}); expected a folder or "
                 "an address such as s3://bucket/lake"
             ) from None
 
@@ -337,7 +337,7 @@ def _stamp(meta: Any) -> Stamp:
 
 
 def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+    return masked((str(error).splitlines() or [type(error).__name__])[0])
 
 
 def open_store(root: Path | str) -> Store:

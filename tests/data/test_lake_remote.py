@@ -36,6 +36,20 @@ def test_files_are_named_as_in_a_folder(address: str, tmp_path: Path) -> None:
     assert kept[0] == kept[1]
 
 
+@pytest.mark.parametrize(
+    "address",
+    [
+        "https://TOKEN@127.0.0.1:9/lake",
+        "https://127.0.0.1:9/lake?access_token=TOKEN",
+        "ftp://TOKEN@127.0.0.1/?api_key=TOKEN",
+    ],
+)
+def test_what_cannot_be_reached_is_named_without_what_is_secret(address: str) -> None:
+    with pytest.raises((InputError, WorkError)) as said:
+        Lake(address).machines()
+    assert "TOKEN" not in str(said.value) and "127.0.0.1" in str(said.value)
+
+
 def test_a_lake_on_s3(s3: str) -> None:
     """The small version of what the others do."""
     address = f"{s3}/lake-{uuid4().hex}"
