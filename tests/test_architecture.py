@@ -110,6 +110,14 @@ def test_only_pipelines_imports_what_orchestrates_and_tracks() -> None:
     assert not wrong
 
 
+def test_no_module_executes_text() -> None:
+    """What runs at a machine is data that its digest covers, or this code."""
+    for path in _modules().values():
+        calls = [n.func for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.Call)]
+        named = {f.id for f in calls if isinstance(f, ast.Name)}
+        assert not named & {"exec", "eval", "compile"}, path
+
+
 def test_two_modules_import_torch() -> None:
     """Without it everything else works, see tests/thermodrift/test_without_torch.py."""
     assert {name for name, others in graph().items() if any(o.split(".")[0] == "torch" for o in others)} == TRAINERS
