@@ -83,6 +83,28 @@ def test_one_reading_of_a_residual_that_returns_to_0_does_not_harm() -> None:
     assert S_um.mean() < held_S_um.mean() and more_um.mean() <= more_um.std(ddof=1) / np.sqrt(len(more_um))
 
 
+@pytest.mark.parametrize("minutes", [0.0, 10.0])
+@pytest.mark.parametrize("schedule", [Readings(), Readings(3600.0, 3600.0)])
+def test_readings_of_a_residual_that_does_not_last_change_nothing(minutes: float, schedule: Schedule) -> None:
+    """A residual that is forgotten within minutes says nothing of the hours after it."""
+    keep = np.exp(-5.0 / minutes) if minutes else 0.0
+
+    def run(rng: np.random.Generator) -> Track:
+        residual_um = np.zeros(73)
+        for k in range(1, 73):
+            residual_um[k] = keep * residual_um[k - 1] + 3.0 * np.sqrt(1 - keep**2) * rng.normal()
+        return Track(TIME_S, 10 * HOURS, 10 * HOURS + residual_um, HOURS[:, None] / 6)
+
+    rng, done = np.random.default_rng(7), []
+    for _ in range(8):
+        updater = Updater.learn([run(rng) for _ in range(12)])
+        done += [scores(updater, run(rng), schedule) for _ in range(8)]
+    _, S_um, held_S_um, free_S_um, _ = np.array(done).T
+    more_um = S_um - free_S_um
+    assert held_S_um.mean() > 1.2 * free_S_um.mean(), "the residual lasts"
+    assert more_um.mean() <= max(more_um.std(ddof=1) / np.sqrt(len(more_um)), 1e-3 * free_S_um.mean())
+
+
 def serving(schedule: Schedule, seed: int, back: float = 0.0) -> np.ndarray:
     """`scores` (5, 8) of eight runs by an updater of sixteen others."""
     updater = Updater.learn(heavy_tailed(100 + seed, 16, back))
