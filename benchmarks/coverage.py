@@ -8,7 +8,8 @@ the left-out runs of each, and their disagreement. Columns, over all error chann
 - below: share of S below the run's bound, with a Wilson 95 % interval; bound/S: mean bound over mean S;
 - next: the same for the bound of `expected_next`; naive: for the 90 % quantile of leave-batch-out;
 - doubled: share of runs with more than twice the S that `expected_next` promised;
-- caught: how many of these were flagged beforehand; false: flagged among the others; above: flagged runs above bound.
+- caught: how many of these were flagged beforehand; false: flagged among the others; above: flagged runs above bound;
+- weighed: what the authority that falls outside the trained region changes of S, % (geometric mean ± standard error).
 The recordings of lathe and spindle are read from --data; machines without data are left out.
 """
 
@@ -101,12 +102,14 @@ def bounded(
             model = StoredModel(fitted, machine, Region.of(crossing.batches, fitted.inputs), {}, bound, tuple(siblings))
             for k in block.test:
                 predicted_um = fitted.predict(kept[k])
-                S_um = float(residual_std_um(zeroed_error_um(kept[k], target) - predicted_um))
+                error_um, weight = zeroed_error_um(kept[k], target), model.weight(model.distance(kept[k]))
+                S_um = float(residual_std_um(error_um - predicted_um))
                 if not np.isfinite(S_um):  # an input is masked throughout
                     continue
                 yield {
                     "target": target, "cell": "|".join(map(str, cell)), "block": block.name,
                     "batch_id": kept[k].batch_id, "S_um": S_um,
+                    "weighed_S_um": float(residual_std_um(error_um - weight * predicted_um)),
                     **model.run_error(kept[k], predicted_um)._asdict(), "next_S_um": promised.S_um,
                     "next_bound_um": promised.bound_um, "naive_um": float(np.quantile(near, 0.9)),
                 }  # fmt: skip
@@ -124,7 +127,9 @@ def summary(rows: pd.DataFrame) -> dict[str, str]:
     doubled = S_um > 2 * rows["next_S_um"].to_numpy(float)
     flagged = (rows["flagged"] != "").to_numpy()
     above = S_um > rows["bound90_S_um"].to_numpy(float)
+    weighed = np.log(rows["weighed_S_um"] / S_um).groupby(rows["batch_id"]).mean()
     return {
+        "weighed %": f"{100 * weighed.mean():+.1f} ± {100 * weighed.sem():.1f}",
         "runs": str(len(rows)), "below % bound/S": against("bound90_S_um"), "next": against("next_bound_um"),
         "naive": against("naive_um"), "doubled": f"{doubled.sum()}", "caught": f"{(doubled & flagged).sum()}",
         "false %": f"{100 * flagged[~doubled].mean():.0f}", "above": f"{(above & flagged).sum()}/{above.sum()}",

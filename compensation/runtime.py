@@ -25,7 +25,7 @@ from data.errors import InputError
 from models.numerics.kernels import scale_of
 from models.program import Program, State
 from models.selection.conformal import RunBound
-from models.selection.trust import SLACK, Region
+from models.selection.trust import Region, worth
 from models.selection.updating import State as Learned
 from models.selection.updating import Updater
 
@@ -79,16 +79,13 @@ class AxisModel:
             raise InputError(f"axis {self.axis}: got authority {self.share!r}, expected above 0 up to 1; train again")
 
     def authority(self, distance: float) -> float:
-        """Share of the correction that is applied so far outside of the trained region, in widths: at most `share`.
+        """Share of the correction that is applied so far outside of the trained region, in widths, at most `share`."""
+        return min(self.share, float(worth(distance, self.tested)))
 
-        The error there is expected to be `RunBound.factor` times that of an ordinary run; a correction whose error
-        grows by a factor is worth its inverse. Without a bound it falls with the distance itself.
-        """
-        if distance <= SLACK:
-            return self.share
-        if self.bound is None or not math.isfinite(factor := self.bound.factor(math.nan, distance)):
-            return min(self.share, 1.0 / (1.0 + distance))
-        return min(self.share, 1.0 / factor)
+    @property
+    def tested(self) -> float:
+        """How far outside of their training's region runs were that were left out, in widths."""
+        return self.bound.tested if self.bound is not None else 0.0
 
     @property
     def largest_surprise_um(self) -> float:

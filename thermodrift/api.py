@@ -223,7 +223,8 @@ def predict(model: StoredModel | Path | str, recording: Batch | Path | str) -> p
 
     Returns:
         batch_id, time_s (s), predicted_um (µm, relative to the batch's start), outside_region, outside_of, distance,
-        expected_S_um, bound90_S_um, flagged, simulated, standing; for an error along an axis position_mm as well.
+        authority, expected_S_um, bound90_S_um, flagged, simulated, standing; for an error along an axis position_mm as
+        well.
 
     Raises:
         InputError: a model or file that cannot be used, or a missing input.

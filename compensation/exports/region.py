@@ -34,12 +34,10 @@ def trust_program(a: AxisModel, known: Mapping[str, Channel]) -> Program | None:
         scores = b.affine(points, region.directions.T, -region.directions.T @ region.centre)
         beyond.append(_excess(b, scores, region.low, region.high, region.pattern()["spread"]))
     distance = _largest(b, b.join(*beyond))
-    # The factor of `RunBound` is a power of 1 + distance; without a bound it is 1 + distance itself.
-    slope = a.bound.slopes[1] if a.bound is not None else 1.0
     one = b.constant(1.0)
-    worth = b.add("power", [b.two("add", one, distance)], 1, exponents=[-slope])
-    outside = b.two("less", b.constant(SLACK), distance)
-    trust = b.select(outside, b.two("min", b.scaled(worth, np.array([a.share])), one), one)
+    untested = b.two("max", b.sub(distance, b.constant(max(a.tested, SLACK))), b.constant(0.0))
+    worth = b.add("power", [b.two("add", one, untested)], 1, exponents=[-1.0])
+    trust = b.two("min", b.scaled(worth, np.array([a.share])), one)
     return b.program([trust], zero_start=False)
 
 

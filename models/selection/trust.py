@@ -165,6 +165,12 @@ class Region:
                    *(np.asarray(plain[k], float) for k in ("centre", "directions", "low", "high")))  # fmt: skip
 
 
+def worth(distance: Array | float, tested: float) -> Array:
+    """What a correction is worth so far outside the region, in widths: all of it as far as runs were left out
+    (`RunBound.tested`), from there on less with the distance."""
+    return np.asarray(1.0 / (1.0 + np.maximum(distance - np.fmax(tested, SLACK), 0.0)))
+
+
 def watched(batch: Batch, inputs: Sequence[str]) -> dict[str, Array]:
     """The quantities of a batch that a region knows: inputs, start temperatures of their channels, drivers."""
     return {name: feature(batch, name) for name in _watched_names(batch, inputs)}

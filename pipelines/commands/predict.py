@@ -104,10 +104,11 @@ def predict_batches(model: StoredModel, batches: Iterable[Batch]) -> pd.DataFram
     Returns:
         batch_id, time_s (s), for an error along an axis position_mm, predicted_um (relative to the batch's start; NaN
         where an input or the position is missing), outside_region (the row extrapolates), outside_of (which
-        quantities), distance (in widths of the trained range), of the whole run expected_S_um, bound90_S_um (nine runs
-        in ten stay below) and flagged (why the run is unlike those that the bound comes from, empty where it is not),
-        unit (of the error; where it is not um, predicted_error, expected_S_error and bound90_S_error take the place of
-        the columns in um), simulated (model or recording), standing (of the model: champion, provisional or refused).
+        quantities), distance (in widths of the trained range), authority (the share of the correction that is sent at
+        this distance), of the whole run expected_S_um, bound90_S_um (nine runs in ten stay below) and flagged (why the
+        run is unlike those that the bound comes from, empty where it is not), unit (of the error; where it is not um,
+        predicted_error, expected_S_error and bound90_S_error take the place of the columns in um), simulated (model or
+        recording), standing (of the model: champion, provisional or refused).
 
     Raises:
         InputError: an input of the model is missing.
@@ -124,6 +125,7 @@ def predict_batches(model: StoredModel, batches: Iterable[Batch]) -> pd.DataFram
             "batch_id": batch.batch_id, "time_s": batch.time_s,
             **({"position_mm": batch.masked(along)} if along else {}), "predicted_um": predicted,
             "outside_region": [bool(o) for o in outside], "outside_of": outside, "distance": distance,
+            "authority": model.weight(distance),
             **run._asdict(), "unit": unit, "simulated": model.simulated or batch.simulated, "standing": model.standing,
         }))  # fmt: skip
     names = {n: error_column(n, unit) for n in ("predicted_um", "expected_S_um", "bound90_S_um")}

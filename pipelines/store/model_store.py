@@ -27,7 +27,7 @@ from data.files import from_json
 from data.machine import Machine, parse_machine
 from models.base import Family, family_from_plain
 from models.selection.conformal import RunBound
-from models.selection.trust import SLACK, Region, disagreement_um, farthest, watched
+from models.selection.trust import SLACK, Region, disagreement_um, farthest, watched, worth
 from models.selection.updating import Updater
 from pipelines.store.audit import CHAMPION
 
@@ -132,6 +132,11 @@ class StoredModel:
     def distance(self, batch: Batch) -> Array:
         """Distance of each row (n,) from the trained region, in trained widths; 0 inside."""
         return self.region.distance(watched(batch, self.family.inputs))
+
+    def weight(self, distance: Array) -> Array:
+        """The share of the correction (n,) that is sent at a distance from the trained region."""
+        tested = self.bound.tested if self.bound is not None else 0.0
+        return np.minimum(self.authority, worth(np.nan_to_num(distance), tested))
 
     def run_error(self, batch: Batch, predicted_um: Array) -> RunError:
         """The error to expect of a run from its inputs and its prediction (n,)."""

@@ -214,8 +214,8 @@ def test_a_model_at_the_control_sends_what_the_core_does(seed: int, tmp_path: Pa
 @pytest.mark.parametrize("share", [1.0, 0.6])
 def test_the_trust_of_an_export_is_that_of_the_runtime(share: float) -> None:
     *train, left = make_toy_batches(8, 60)
-    far_away = replace(left, table=left.table.assign(t0=left.table["t0"] * 1.4, room=left.table["room"] + 15.0))
-    for bound in (None, RunBound(1.0, 2.0, (0.3, 1.7), 1.0, 0.1, 5.0, 0.9, 8)):
+    far_away = replace(left, table=left.table.assign(t0=left.table["t0"] * 3, room=left.table["room"] + 30.0))
+    for bound in (None, RunBound(1.0, 2.0, (0.3, 1.7), 1.0, 0.1, 0.4, 0.9, 8)):
         model = replace(model_of(train), share=share, bound=bound)
         program = trust_program(model, left.channels)
         assert program is not None and set(program.channels) <= set(model.program.channels)

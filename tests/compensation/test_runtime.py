@@ -83,6 +83,15 @@ def test_a_share_is_sent_and_every_record_says_why(share: float) -> None:
     assert all(c.reasons["z"].endswith(f"provisional model: {share:g}") for c in done)
 
 
+@pytest.mark.parametrize(("tested", "kept"), [(0.0, 0.05), (0.7, 0.7), (math.nan, 0.05)])
+def test_the_authority_holds_as_far_as_runs_were_left_out_and_falls_without_a_step_beyond(tested, kept) -> None:
+    model = replace(model_of(make_toy_batches(4, 20)), bound=RunBound(1.0, 2.0, (0.3, 1.7), 1.0, 0.1, tested, 0.9, 8))
+    assert model.authority(0.0) == model.authority(kept) == 1.0
+    assert model.authority(kept + 1e-9) == pytest.approx(1.0) and model.authority(kept + 1.0) == pytest.approx(0.5)
+    assert replace(model, share=0.4).authority(kept + 1.0) == 0.4
+    assert replace(model, share=0.4).authority(kept + 3.0) == pytest.approx(0.25)
+
+
 @pytest.mark.parametrize("share", [0.0, -0.1, 1.1, math.nan])
 def test_a_share_that_makes_no_sense_is_refused(share: float) -> None:
     with pytest.raises(InputError, match=r"^axis z: got authority .*, expected above 0 up to 1; train again$"):

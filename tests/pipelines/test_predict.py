@@ -65,7 +65,7 @@ def test_a_raw_file_is_predicted_from_any_folder(promoted, store, tmp_path, monk
     if uri.startswith("runs:"):
         uri = f"runs:/{training_id}/model"
     got = predict_file(uri.format(name=promotion.name, run=training_id), Path("run7.csv"), store)
-    assert list(got) == ["batch_id", "time_s", "predicted_um", "outside_region", "outside_of", "distance",
+    assert list(got) == ["batch_id", "time_s", "predicted_um", "outside_region", "outside_of", "distance", "authority",
                          "expected_S_um", "bound90_S_um", "flagged", "unit", "simulated", "standing"]  # fmt: skip
     assert np.allclose(got["predicted_um"], law_um(table), atol=1e-6)
     assert not got["outside_region"].any()
@@ -178,6 +178,8 @@ def test_a_run_unlike_the_training_is_flagged_with_the_reason_and_expected_to_be
     runs = table.groupby("batch_id").first()
     assert list(runs["flagged"]) == ["", "front at start 46 degC, trained 20 to 27"]
     assert runs["expected_S_um"].iloc[1] > 1.1 * runs["expected_S_um"].iloc[0]
+    far = bounded.distance(hot)[0]
+    assert far > 1 and list(runs["authority"]) == pytest.approx([1.0, 1 / (1 + far - 0.05)])
     line = summary(table)
     assert re.match(r"warning: 2 runs: expect S [\d.]+ to [\d.]+ µm, 90 % below [\d.]+ to [\d.]+ µm; ", line)
     assert f"run {hot.batch_id} is unlike the training ({runs['flagged'].iloc[1]}): error may exceed" in line
