@@ -21,11 +21,12 @@ class Outlook:
 
     `S_um` is the mean left-out S under `protocol`, the one nearest to the next season that the recordings allow. Where
     choosing among the cells costs, it is the nested score: every run by the cell that the other runs chose; `cell_S_um`
-    is that of the chosen cell itself, which the choice flatters.
+    is that of the chosen cell itself, which the choice flatters. `S_std_um` is over the runs of the one that leads.
     `bound_um` covers the S of the next run with 90 % (`models.selection.conformal.expected_next`); `n_runs` under
     `protocol`. `leave_batch_out_um`, `leave_batch_out_std_um`: S_mean and S_std by leave-batch-out; NaN where it was
     not run. `warning`: the failing season, speed or block, where later runs are much worse than runs left out one by
-    one. `note`: why the number is optimistic, where the order in time is not known.
+    one. `note`: why the number is optimistic, where the order in time is not known. `kept`: what the blocks before each
+    later one promised, and what was held.
     """
 
     protocol: str
@@ -37,6 +38,8 @@ class Outlook:
     warning: str = ""
     note: str = ""
     cell_S_um: float = float("nan")
+    S_std_um: float = float("nan")
+    kept: str = ""
 
     @property
     def summary(self) -> str:
@@ -47,7 +50,7 @@ class Outlook:
             parts.append(f"the chosen cell itself, flattered by the choice, {self.cell_S_um:.2f} µm")
         if self.protocol != "leave-batch-out" and np.isfinite(self.leave_batch_out_um):
             parts.append(f"leave-batch-out {self.leave_batch_out_um:.2f} ± {self.leave_batch_out_std_um:.2f} µm")
-        return "; ".join(p for p in [*parts, self.note] if p)
+        return "; ".join(p for p in [*parts, self.kept, self.note] if p)
 
     @property
     def headline(self) -> str:
@@ -57,7 +60,8 @@ class Outlook:
     @property
     def _number(self) -> str:
         where = "next season" if self.protocol == "forward" else f"by {self.protocol}"
-        return f"expected error {where}: S {self.S_um:.2f} µm, 90 % of runs below {self.bound_um:.2f} µm"
+        spread = f" ± {self.S_std_um:.2f}" if np.isfinite(self.S_std_um) else ""
+        return f"expected error {where}: S {self.S_um:.2f}{spread} µm, 90 % of runs below {self.bound_um:.2f} µm"
 
     @property
     def nested(self) -> bool:
@@ -79,10 +83,26 @@ def outlook(result: GridResult, choice: Choice) -> Outlook:
     warning = _warning(result, later, near) if len(later) and len(near) else ""
     nested_um = choice.nested_S_mean_um if choice.protocol == led.protocol else led.S_um
     cost = max(nested_um / led.S_um, 1.0) if led.S_um > 0 and np.isfinite(nested_um) else 1.0
+    spread_um = choice.nested_S_std_um if cost > 1.0 else float(own.loc[own["protocol"] == led.protocol, "S_um"].std())
     return Outlook(
         led.protocol, cost * led.S_um, cost * led.bound_um, led.n_runs, mean, std, warning,
-        _note(result, led.protocol), led.S_um,
+        _note(result, led.protocol), led.S_um, spread_um, _kept(later),
     )  # fmt: skip
+
+
+def _kept(later: pd.DataFrame) -> str:
+    """What the blocks before each later one promised, and what was held; empty for fewer than two blocks."""
+    blocks = [g for _, g in later.groupby("fold", sort=False)]
+    promised = [expected_next(pd.concat(blocks[:k])) for k in range(1, len(blocks))]
+    if not promised:
+        return ""
+    sizes, held = [len(g) for g in blocks[1:]], pd.concat(blocks[1:])["S_um"]
+    below = sum(int((g["S_um"] <= p.bound_um).sum()) for g, p in zip(blocks[1:], promised, strict=True))
+    mean_um = np.average([p.S_um for p in promised], weights=sizes)
+    return (
+        f"promised from earlier runs S {mean_um:.2f} µm, held {held.mean():.2f} ± {held.std():.2f} µm; {below} of "
+        f"{len(held)} later runs below the promised bound"
+    )
 
 
 def _note(result: GridResult, protocol: str) -> str:

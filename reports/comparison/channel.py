@@ -121,7 +121,8 @@ def sentence(c: Channel, rule: PromotionRule) -> tuple[Text, ...]:
     """What the channel's model removes of the error of runs that it has not seen, how many runs a champion lacks, and
     what to doubt about it."""
     of = "later runs" if c.expected.protocol == "forward" else "left-out runs"
-    S, none, bound = (f"{number(v, c.digits)} µm" for v in (c.expected.S_um, c.none_um, c.expected.bound_um))
+    S = f"{plus_minus(c.expected.S_um, c.expected.S_std_um, c.digits)} µm"
+    none, bound = (f"{number(v, c.digits)} µm" for v in (c.none_um, c.expected.bound_um))
     share = _share(*removed(c.runs, c.cost))
     text = f"{c.label} removes {share} of the error of {of}, from S {none} to {S}."
     if c.choice.family == "zero":
@@ -130,6 +131,8 @@ def sentence(c: Channel, rule: PromotionRule) -> tuple[Text, ...]:
         text = f"{c.label} leaves S {S} of {of}."
     below = int((c.runs["S_um"] <= c.expected.bound_um).sum())
     tested = f"{below} of {count(len(c.runs), 'left-out run')} stay below the 90 % bound of {bound}."
+    if c.expected.kept:
+        tested += f" {c.expected.kept[:1].upper()}{c.expected.kept[1:]}."
     doubts = [c.verdict.caution, *(f"{t[:1].upper()}{t[1:]}." for t in (c.expected.warning, c.expected.note) if t)]
     if c.verdict.outcome != "champion" and (few := lacking(c.result, rule, c.choice)):
         text += f" {few[:1].upper()}{few[1:]}."
@@ -140,7 +143,8 @@ def sentence(c: Channel, rule: PromotionRule) -> tuple[Text, ...]:
 def leaders(channels: Sequence[Channel], rule: PromotionRule, unit: str) -> Table:
     """The chosen model of every channel, marked, and the runners-up of other families."""
     columns = (
-        Column("model"), Column("expected S", unit, "number"), Column("removed", "± standard error", "number"),
+        Column("model"), Column("expected S", f"± S_std, {unit}", "number"),
+        Column("removed", "± standard error", "number"),
         Column("leave-batch-out", f"S_mean ± S_std, {unit}", "number"),
         Column("loss against the chosen", f"± standard error, {unit}", "number"),
     )  # fmt: skip
@@ -157,13 +161,14 @@ def leaders(channels: Sequence[Channel], rule: PromotionRule, unit: str) -> Tabl
 def _leaders(c: Channel, rule: PromotionRule) -> list[Row]:
     optimistic = "" if c.expected.protocol == "forward" else " ‡"
     own = Cell(f"{c.name}: {c.label}", chip=(c.verdict.chip, c.verdict.outcome))
-    S, share = number(c.expected.S_um, c.digits) + optimistic, _share(*removed(c.runs, c.cost))
+    S, share = plus_minus(c.expected.S_um, c.expected.S_std_um, c.digits) + optimistic, _share(*removed(c.runs, c.cost))
     rows = [Row.of(own, S, share, _near(c, *_key(c.choice)), NOTHING, look="marked")]
     for row in _others(c, rule):
         key = (row["selector"], row["family"], int(row["n_tsp"]))
         runs = _runs(c.result, *key, c.expected.protocol)
         behind = plus_minus(row["behind_um"], row["se_um"], max(c.digits, 2)) if "se_um" in row else NOTHING
-        S, share = number(float(runs["S_um"].mean()), c.digits) + optimistic, _share(*removed(runs))
+        S = plus_minus(float(runs["S_um"].mean()), float(runs["S_um"].std()), c.digits) + optimistic
+        share = _share(*removed(runs))
         rows.append(Row.of(f"{c.name}: {cell_label(*key)}", S, share, _near(c, *key), behind))
     return rows
 

@@ -37,17 +37,25 @@ def test_it_leads_with_forward_and_then_leave_batch_out() -> None:
     got = chosen(trained([2.0, 2.4, 2.2, 2.6]))
     assert (got.protocol, got.n_runs, got.S_um) == ("forward", 4, pytest.approx(2.3))
     assert got.summary == (
-        f"expected error next season: S 2.30 µm, 90 % of runs below {got.bound_um:.2f} µm (forward, 4 runs); "
-        "leave-batch-out 2.00 ± 0.00 µm"
+        f"expected error next season: S 2.30 ± 0.26 µm, 90 % of runs below {got.bound_um:.2f} µm (forward, 4 runs); "
+        f"leave-batch-out 2.00 ± 0.00 µm; {got.kept}"
     )
     assert 2.6 < got.bound_um < 2 * 2.6
+
+
+def test_what_earlier_blocks_promised_stands_next_to_what_later_ones_held() -> None:
+    got = chosen(trained([2.0, 2.4, 2.2, 9.0]))
+    assert got.kept == (
+        "promised from earlier runs S 2.20 µm, held 5.60 ± 4.81 µm; 1 of 2 later runs below the promised bound"
+    )
+    assert chosen(trained([2.0, 2.4])).kept == ""
 
 
 def test_much_worse_is_said_first_and_names_the_season_that_fails() -> None:
     got = chosen(trained([2.0, 9.0, 2.0, 11.0]))
     assert got.summary.startswith(
         "later runs fail: S 6.0 µm forward in time, 2.0 µm where only the run itself is left out; "
-        "worst in season warm (10.0 µm, runs: 2); expected error next season: S 6.00 µm"
+        "worst in season warm (10.0 µm, runs: 2); expected error next season: S 6.00 ± 4.69 µm"
     )
 
 
@@ -64,13 +72,13 @@ def test_without_forward_the_number_is_called_optimistic_with_the_reason() -> No
     assert got.protocol == "leave-batch-out" and got.note == (
         "optimistic: no later run was predicted from earlier ones (6 of 6 batches have no start time (first: b00))"
     )
-    assert "by leave-batch-out: S 2.00 µm" in got.summary
+    assert "by leave-batch-out: S 2.00 ± 0.00 µm" in got.summary and got.kept == ""
 
 
 def test_where_choosing_costs_the_nested_score_comes_first() -> None:
     result = trained([2.0, 2.4, 2.2, 2.6])
-    choice = replace(pick(result, RULE.only("forward"), "none|mlr|2"), nested_S_mean_um=4.6)
+    choice = replace(pick(result, RULE.only("forward"), "none|mlr|2"), nested_S_mean_um=4.6, nested_S_std_um=1.5)
     got, own = outlook(result, choice), chosen(result)
     assert (got.S_um, got.cell_S_um, got.bound_um) == pytest.approx((4.6, 2.3, 2.0 * own.bound_um))
-    assert "season: S 4.60 µm" in got.summary and "flattered by the choice, 2.30 µm" in got.summary
+    assert "season: S 4.60 ± 1.50 µm" in got.summary and "flattered by the choice, 2.30 µm" in got.summary
     assert outlook(result, replace(choice, nested_S_mean_um=2.2)).S_um == pytest.approx(2.3)

@@ -205,11 +205,13 @@ def test_the_sentences_and_the_leaders_begin_with_the_largest_error(toy_batches:
     lead = own.cells[0]
     assert isinstance(lead, Cell)
     assert (lead.text, lead.chip[0], own.look) == (f"z: {cell_words(choice)}", "provisional", "marked")
-    digits = len(str(own.cells[1]).split(".")[1])
-    assert own.cells[1] == f"{expected.S_um:.{digits}f}"
-    assert z.text.endswith(f"4 of 4 left-out runs stay below the 90 % bound of {expected.bound_um:.{digits}f} µm.")
+    digits = len(str(own.cells[1]).split(" ")[0].split(".")[1])
+    S = f"{expected.S_um:.{digits}f} ± {expected.S_std_um:.{digits}f}"
+    assert own.cells[1] == S and expected.S_std_um > 0
+    bound = f"4 of 4 left-out runs stay below the 90 % bound of {expected.bound_um:.{digits}f} µm."
+    assert z.text.endswith(f"{bound} {expected.kept[:1].upper()}{expected.kept[1:]}.") and expected.kept
     assert z.text.startswith(f"{cell_words(choice)} removes {own.cells[2]} of the error of later runs, from S ")
-    assert z.text.split(" stay")[0].split(". ")[0].endswith(f"to {expected.S_um:.{digits}f} µm")
+    assert z.text.split(" stay")[0].split(". ")[0].endswith(f"to {S} µm")
     runners = [str(r.cells[0]) for r in others[: len(table.rows) // 2 - 1]]
     assert runners and all(r.startswith("z: ") and "no model" not in r for r in runners)
     groups = next(t for t in blocks(page, Table) if t.caption == "z: S_mean by season and speed")
