@@ -104,12 +104,8 @@ class SequenceNet(Family):
         """Weights (S, …) to train from; directions (S, hidden, p) in the inputs have sums of rms 1."""
 
     @abstractmethod
-    def states(self, xp: Any, weights: Weights, x: Any) -> tuple[Any, tuple[Any, ...]]:
-        """States (S, U, T, B) of S nets along x (S, p, T, B), and what `gradient` needs; xp is numpy or torch."""
-
-    @abstractmethod
-    def gradient(self, xp: Any, weights: Weights, x: Any, tape: tuple[Any, ...], slope: Any) -> Weights:
-        """Slopes of a loss by the weights from those by the states, (S, U, T, B)."""
+    def states(self, xp: Any, weights: Weights, x: Any) -> Any:
+        """States (S, U, T, B) of S nets along x (S, p, T, B); xp is numpy or torch."""
 
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """All folds' nets trained as stacks of similar numbers of batches.
@@ -267,7 +263,7 @@ class SequenceNet(Family):
         met, size = np.zeros(len(stack.n_batches)), np.zeros(len(stack.n_batches))
         for x, rest, known in zip(halves.x, halves.rest, halves.known, strict=True):
             x, rest, known = (np.roll(v, len(v) // 2, axis=0) for v in (x, rest, known))
-            predicted = (readout[:, :, None, None] * self.states(np, weights, x)[0]).sum(axis=1) * known
+            predicted = (readout[:, :, None, None] * self.states(np, weights, x)).sum(axis=1) * known
             met += (predicted * rest).sum(axis=(1, 2)).reshape(2, -1).sum(axis=0)
             size += (predicted**2).sum(axis=(1, 2)).reshape(2, -1).sum(axis=0)
         return np.clip(met / np.where(size > 0, size, 1.0), 0.0, 1.0)
@@ -283,7 +279,7 @@ class SequenceNet(Family):
         n_nets, n_batches, n_phases, n_steps, p = x.shape
         along = np.ascontiguousarray(x.transpose(0, 4, 3, 1, 2)).reshape(n_nets, p, n_steps, -1)
         with np.errstate(invalid="ignore"):
-            states, _ = self.states(np, dict(zip(self.weights, arrays, strict=True)), along)
+            states = self.states(np, dict(zip(self.weights, arrays, strict=True)), along)
         net = (readout_um[:, None] @ states.reshape(n_nets, readout_um.shape[1], -1)).reshape(n_nets, n_steps, -1)
         columns = memory_columns(x).reshape(n_nets, -1, linear.shape[1])
         rest = (columns @ linear[:, :, None]).reshape(n_nets, -1, n_steps).swapaxes(1, 2)

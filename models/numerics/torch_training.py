@@ -29,9 +29,7 @@ class Trainable(Protocol):
     decay: float
     readout_decay: float
 
-    def states(self, xp: Any, weights: Weights, x: Any) -> tuple[Any, tuple[Any, ...]]: ...
-
-    def gradient(self, xp: Any, weights: Weights, x: Any, tape: tuple[Any, ...], slope: Any) -> Weights: ...
+    def states(self, xp: Any, weights: Weights, x: Any) -> Any: ...
 
 
 def train(net: Trainable, stack: Stack, start: Weights) -> tuple[Weights, Array]:
@@ -47,11 +45,11 @@ def train(net: Trainable, stack: Stack, start: Weights) -> tuple[Weights, Array]
     """
     device = _device(net)
     torch.get_num_threads()  # torch sets a thread's count at its first use there, which would undo the limit
-    with openmp().limit(limits=1), torch.inference_mode():
+    with openmp().limit(limits=1):
         share = 1.0 / stack.n_batches
         rows = Rows(*(torch.tensor(part, device=device) for part in (stack.x, stack.rest, stack.known, share)))
         weights = _descend(net, rows, {name: torch.tensor(start[name], device=device) for name in net.weights})
-        sums = [rows.sums(phase, net.states(torch, weights, rows.x[phase])[0]) for phase in range(len(rows.x))]
+        sums = [rows.sums(phase, net.states(torch, weights, rows.x[phase])) for phase in range(len(rows.x))]
         readout = rows.readout([sum(part) for part in zip(*sums, strict=True)], net.readout_decay)
         return {name: w.cpu().numpy() for name, w in weights.items()}, readout.cpu().numpy()
 
@@ -79,34 +77,36 @@ class Rows:
         return torch.linalg.solve(square, cross / count)[..., 0]
 
 
-def loss_slopes(net: Trainable, rows: Rows, phase: int, weights: Weights) -> tuple[Tensor, Weights]:
-    """Mean square (S,) that the best readout leaves of a phase, with its penalty, and the slopes by the weights."""
-    states, tape = net.states(torch, weights, rows.x[phase])
-    sums = rows.sums(phase, states)
+def losses(net: Trainable, rows: Rows, phase: int, weights: Weights) -> Tensor:
+    """Mean square (S,) that the best readout leaves of a phase, with its penalty, as a function of the weights."""
+    states = net.states(torch, weights, rows.x[phase])
+    sums = rows.sums(phase, states.detach())  # at the best readout the partial slope is the whole one
     v = rows.readout(sums, net.readout_decay)
-    count = sums[2].clamp(min=1.0)[:, None, None]
     left = ((states * v[:, :, None, None]).sum(dim=1) - rows.rest[phase]) * rows.known[phase]
-    loss = left.square().sum(dim=(1, 2)) / count[:, 0, 0] + net.readout_decay * rows.share * v.square().sum(dim=1)
-    slope = v[:, :, None, None] * (left * (2.0 / count))[:, None]
-    return loss, net.gradient(torch, weights, rows.x[phase], tape, slope)
+    return left.square().sum(dim=(1, 2)) / sums[2].clamp(min=1.0) + net.readout_decay * rows.share * v.square().sum(1)
 
 
 def _descend(net: Trainable, rows: Rows, weights: Weights) -> Weights:
     """The weights after `net.epochs` steps of Adam."""
-    sizes = [weights[name][0].numel() for name in net.weights]
     start = torch.cat([weights[name].flatten(1) for name in net.weights], dim=1)
+    sizes, shapes = zip(*((w[0].numel(), w.shape) for w in map(weights.__getitem__, net.weights)), strict=True)
+
+    def named(theta: Tensor) -> Weights:
+        parts = zip(net.weights, theta.split(sizes, dim=1), shapes, strict=True)
+        return {name: part.reshape(shape) for name, part, shape in parts}
+
     theta, mean, square = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
     pull = 2.0 * net.decay * rows.share[:, None]
     for step in range(net.epochs):
-        _, slopes = loss_slopes(net, rows, step % len(rows.x), weights)
-        slope = torch.cat([slopes[name].flatten(1) for name in net.weights], dim=1) + pull * (theta - start)
+        theta.requires_grad_()
+        (slope,) = torch.autograd.grad(losses(net, rows, step % len(rows.x), named(theta)).sum(), theta)
+        theta = theta.detach()
+        slope = slope + pull * (theta - start)
         mean.lerp_(slope, 1.0 - _MOMENTUM)
         square.lerp_(slope.square(), 1.0 - _SECOND)
         rate = 0.5 * net.rate * (1.0 + math.cos(math.pi * step / net.epochs)) / (1.0 - _MOMENTUM ** (step + 1))
         theta = theta - rate * mean / ((square / (1.0 - _SECOND ** (step + 1))).sqrt() + _FLOOR)
-        parts = zip(net.weights, theta.split(sizes, dim=1), strict=True)
-        weights = {name: part.reshape(weights[name].shape) for name, part in parts}
-    return weights
+    return named(theta)
 
 
 def _device(net: Trainable) -> str:
