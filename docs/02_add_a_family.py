@@ -22,7 +22,6 @@ class NearestBatch(Family):
     key = "nearest_batch"
     summary = "the most similar training batch's own error"
     source = "an example"
-    rowwise = False
 
     def fit_design(self, design: Design, train: Sequence[int]) -> Self:
         usable = int(np.isfinite(design.y_um[np.isin(design.group, list(train))]).sum())

@@ -42,7 +42,6 @@ class Family(ABC):
     source: ClassVar[str]
     uses_inputs: ClassVar[bool] = True  # False for baselines: every selector and n_tsp gives the same model
     closed_form: ClassVar[bool] = True  # False: iterative, so the grid takes a stated few n_tsp
-    rowwise: ClassVar[bool] = True  # a prediction at a row needs that row alone (sklearn's checks apply)
     needs_twin: ClassVar[bool] = False  # True: only for machines whose file has a twin part
     needs_position: ClassVar[bool] = False  # True: only for error channels that are measured along an axis
     shares_targets: ClassVar[bool] = False  # True: error channels of one training set share most of the work

@@ -156,7 +156,6 @@ class AxisCoupled(Family):
         "offset by the spindle and slope by the screw along an axis, terms by leave-batch-out in the training batches"
     )
     source = "coupled-lathe study: fuzzy clustering, correlation, MLR for spindle offset and screw slope"
-    rowwise = False
     needs_position = True
     rank = 13
 

@@ -53,7 +53,6 @@ class DistributedLag(Family):
     key = "distributed_lag"
     summary = "distributed lag: temperatures of now and before, geometric, polynomial or free"
     source = "Koyck 1954; Almon 1965"
-    rowwise = False
     rank = 25
 
     def __init__(

@@ -48,7 +48,6 @@ class GM1N(Family):
     key = "gm1n"
     summary = "grey model GM(1,N), free-running"
     source = "Deng 1989"
-    rowwise = False
     rank = 30
 
     def __init__(self, response: str = "difference", slowest_h: float = 24.0, recent_rows: int | None = None) -> None:

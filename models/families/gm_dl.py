@@ -43,7 +43,6 @@ class GMDL(Family):
     summary = "grey model and distributed lag, piecewise by start temperature"
     source = "Deng 1989; Almon 1965"
     closed_form = False
-    rowwise = False
     rank = 45
 
     def __init__(

@@ -38,7 +38,6 @@ class GMLSSVM(Family):
     summary = "grey models of several lengths, corrected by an LS-SVM"
     source = "Deng 1989; Suykens et al. 2002; study of a THM6380 machining centre"
     closed_form = False
-    rowwise = False
     rank = 65
 
     def __init__(

@@ -242,7 +242,6 @@ class LagDictionary(Family):
     summary = "dictionary of lags of temperatures, drivers and the start, batches pooled with a drift of their own"
     source = "generalised least squares with random effects, Henderson (1975); weights after Geisser and Eddy (1979)"
     closed_form = False
-    rowwise = False
     has_sd = True
     rank = 30
 

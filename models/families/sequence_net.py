@@ -68,7 +68,6 @@ class SequenceNet(Family):
 
     closed_form = False
     packages = ("torch",)
-    rowwise = False
     rank = 80
     weights: ClassVar[tuple[str, ...]]  # names of the net's arrays
 

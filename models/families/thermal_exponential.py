@@ -39,7 +39,6 @@ class ThermalExponential(Family):
     summary = "exponential warm-up driven by spindle speed or time alone"
     source = "Newton's law of cooling; Golub and Pereyra 1973"
     uses_inputs = False
-    rowwise = False
     rank = 5
 
     def __init__(self, lags: int = 2) -> None:

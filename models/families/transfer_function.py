@@ -69,7 +69,6 @@ class TransferFunction(Family):
     summary = "first-order responses to the sensors and to what is not settled at the start"
     source = "Ljung 1999, eq. 4.25; Golub and Pereyra 1973"
     closed_form = False
-    rowwise = False
     has_sd = True
     rank = 30
 

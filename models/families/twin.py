@@ -37,7 +37,6 @@ class Twin(Family):
     summary = "physics twin, calibrated on the training batches, free-running from drivers and surroundings"
     source = "machine file; Mayr et al. (2012), CIRP Annals 61(2), sec. 4; MAP least squares, Tarantola (2005), ch. 3"
     uses_inputs = False
-    rowwise = False
     needs_twin = True
     shares_targets = True
     rank = 30

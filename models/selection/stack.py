@@ -48,7 +48,6 @@ class Stack(Family):
     summary = "weighted sum of the best families, weights not negative"
     source = "Breiman (1996), Machine Learning 24, 49"
     closed_form = False
-    rowwise = False
     combines = True
     rank = 60
 
