@@ -117,7 +117,7 @@ class LSSVM(KernelExpansion):
         alike = [np.flatnonzero([len(gap) == size for gap in sets]) for size in sorted({len(gap) for gap in sets})]
         best = _Best.empty(len(sets), problem.n)
         for sigma, gamma, system in problem.systems(self):
-            score = problem.score(_inner_residuals(system, m, sets), inside)
+            score = problem.score(system.others_left_out(m, sets), inside)
             for some in alike:
                 better = some[score[some] < best.score[some]]
                 if len(better):
@@ -253,20 +253,6 @@ class _Best:
     def take(self, at: Rows, sigma: float, gamma: float, score: Array, alpha: Array, bias: Array) -> None:
         self.score[at], self.sigma[at], self.gamma[at] = score, sigma, gamma
         self.alpha[at], self.bias[at] = alpha, bias
-
-
-def _inner_residuals(system: Bordered, m: int, sets: Sequence[Rows]) -> Array:
-    """Residuals (F, G, m) of every group when it and the groups of a set are left out."""
-    single = [i for i, gap in enumerate(sets) if len(gap) == 1]
-    single = single if len(single) > 1 else []
-    rest = [i for i in range(len(sets)) if i not in single]
-    n_groups = system.alpha.shape[1] // m
-    out = np.empty((len(sets), n_groups, m))
-    if single:
-        out[single] = system.pairs_left_out(m)[[int(sets[i][0]) for i in single]]
-    if rest:
-        out[rest] = system.others_left_out(m, [sets[i] for i in rest])
-    return out
 
 
 def _stacks(shapes: dict[int, tuple[int, ...]]) -> list[list[int]]:

@@ -214,36 +214,11 @@ class Bordered:
         own = np.einsum("sgigj->sgij", self.inverse.reshape(s, n // m, m, n // m, m))
         return _solved(own, self.alpha.reshape(s, n // m, m))
 
-    def pairs_left_out(self, m: int) -> Array:
-        """Residuals (G, G, m) of the first system: [f, g] those of group g when f and g are both left out.
-
-        `C_PP⁻¹ α_P` over the rows P of both, by elimination of f; one solve serves [f, g] and [g, f].
-        Source: G. Cawley, Leave-one-out cross-validation based model selection criteria for weighted LS-SVMs (2006).
-        """
-        n = self.alpha.shape[1]
-        n_groups = n // m
-        blocks = self.inverse[0].reshape(n_groups, m, n_groups, m).transpose(0, 2, 1, 3)
-        alpha = self.alpha[0].reshape(n_groups, m)
-        alone = self.left_out(m)[0]
-        f, g = np.triu_indices(n_groups, 1)
-        own = np.einsum("ggij->gij", blocks)
-        try:
-            across = np.linalg.inv(own) @ self.inverse[0].reshape(n_groups, m, n)
-        except np.linalg.LinAlgError:
-            return np.full((n_groups, n_groups, m), np.nan)
-        across = across.reshape(n_groups, m, n_groups, m).transpose(0, 2, 1, 3)[f, g]  # C_ff⁻¹ C_fg
-        to_f = blocks[g, f]
-        rest = own[g] - to_f @ across
-        out = np.full((n_groups, n_groups, m), np.nan)
-        e_g = _solved(rest, alpha[g] - (to_f @ alone[f][:, :, None])[..., 0])
-        out[f, g] = e_g
-        out[g, f] = alone[f] - (across @ e_g[:, :, None])[..., 0]
-        return out
-
     def others_left_out(self, m: int, gaps: Sequence[NDArray[np.int64]]) -> Array:
         """Residuals (F, G, m) of the first system: [f, g] those of group g when it and the groups gaps[f] are left out.
 
-        By elimination of the gap, as `pairs_left_out`; NaN for the groups in the gap.
+        `C_PP⁻¹ α_P` over the rows P of both, by elimination of the gap; NaN for the groups in it.
+        Source: G. Cawley, Leave-one-out cross-validation based model selection criteria for weighted LS-SVMs (2006).
         """
         n = self.alpha.shape[1]
         n_groups = n // m
