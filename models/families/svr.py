@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Self
 
@@ -17,8 +18,6 @@ from models.numerics.kernels import KernelExpansion, Rows, evenly, kernel, unit_
 _LEAST_ROWS_PER_BATCH = 3
 _GROUPS = 3  # that the training batches are left out in, when the setting is chosen
 _STEPS_CHOICE, _STEPS_FIT = 2_000, 2_000_000  # of libsvm: a setting that needs more is judged as it stands then
-
-_EPSILON_SVR, _CACHE_MB = 3, 200  # libsvm's number of this kind, and the estimator's cache
 
 
 class SVR(KernelExpansion):
@@ -105,17 +104,13 @@ class SVR(KernelExpansion):
 
 
 def _fitted(omega: Array, y_um: Array, cost: float, epsilon: float, steps: int) -> tuple[Rows, Array, float]:
-    """libsvm's support rows, their weights and the bias in µm, for the kernel matrix and C = cost/n.
+    """The support rows, their weights and the bias in µm, for the kernel matrix and C = cost/n."""
+    from sklearn import config_context, svm  # here alone: a trained model predicts without it
 
-    scikit-learn keeps this function private; its estimator takes more time to check its arguments than to solve a
-    problem of this size. A test holds the result to the estimator's.
-    """
-    from sklearn.svm import _libsvm  # here alone: a trained model predicts without it
-
-    _libsvm.set_verbosity_wrap(0)  # it prints otherwise
     mean_um, spread_um = float(y_um.mean()), float(y_um.std()) or 1.0
-    support, _, _, alpha, bias, *_ = _libsvm.fit(
-        np.ascontiguousarray(omega), (y_um - mean_um) / spread_um, svm_type=_EPSILON_SVR, kernel="precomputed",
-        C=cost / len(y_um), epsilon=epsilon, max_iter=steps, cache_size=_CACHE_MB,
-    )  # fmt: skip
-    return support.astype(np.int64), spread_um * alpha[0], mean_um + spread_um * float(bias[0])
+    machine = svm.SVR(kernel="precomputed", C=cost / len(y_um), epsilon=epsilon, max_iter=steps)
+    with config_context(assume_finite=True, skip_parameter_validation=True), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the most steps
+        machine.fit(omega, (y_um - mean_um) / spread_um)
+    support = machine.support_.astype(np.int64)
+    return support, spread_um * machine.dual_coef_[0], mean_um + spread_um * float(machine.intercept_[0])

@@ -33,19 +33,6 @@ def test_predicts_as_scikit_learn_with_its_own_rbf_does():
     assert abs(len(model.fitted["alpha"]) - len(other.support_)) <= 2
 
 
-def test_the_solver_called_directly_gives_what_scikit_learns_estimator_gives(capfd):
-    design = make_design()
-    model = SVR(**ONE).as_published().fit_design(design, [0, 1, 2, 3])
-    assert capfd.readouterr().out == ""
-    rows = design.group < 4
-    u, y = design.x[rows] / 10.0, design.y_um[rows]
-    omega = np.exp(-0.25 * ((u[:, None] - u[None]) ** 2).sum(axis=2))
-    other = LibSVR(kernel="precomputed", C=2e3 / len(y), epsilon=0.05).fit(omega, (y - y.mean()) / y.std())
-    np.testing.assert_allclose(model.fitted["support"], u[other.support_])
-    np.testing.assert_allclose(model.fitted["alpha"], y.std() * other.dual_coef_[0], rtol=1e-6)
-    assert model.fitted["bias"] == pytest.approx(y.mean() + y.std() * other.intercept_[0])
-
-
 def test_the_choice_is_the_setting_of_least_left_out_error():
     design = make_design(2, sizes=(20, 18, 22, 19, 21, 20))
     sigmas, costs, epsilons = (0.3, 1.0), (30.0, 3e3), (0.05, 0.3)
