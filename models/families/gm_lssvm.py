@@ -31,7 +31,7 @@ class GMLSSVM(Family):
     layer on a grid (`tuning` "closed_form") or by "particle_swarm" as published.
 
     Source: study of a THM6380 machining centre (GM(1,6) of 25, 30, 35 and 40 rows, LS-SVM tuned by particle swarm);
-    Deng 1989; Suykens et al. 2002. The study ran within one batch: `models.families.grey_models`.
+    Deng 1989; Suykens et al. 2002. The study ran within one batch.
     """
 
     key = "gm_lssvm"

@@ -12,11 +12,11 @@ from features.grey import synthetic_degree
 from models.base import Family
 from models.families.bp import BP
 from models.families.gm1n import GM1N
-from models.families.grey_models import sequence_outputs
 from models.families.lssvm import LSSVM
 from thermodrift_exam.plants.types.machines import HMC
 from thermodrift_exam.plants.types.runs import SimulatedRun
 from thermodrift_exam.studies.base import Figure, Ordering, Study
+from thermodrift_exam.studies.grey_sequences import sequence_outputs
 
 SENSORS = tuple(HMC.sensors)
 CHANNELS = ("y", "z")
