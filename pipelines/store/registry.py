@@ -142,7 +142,7 @@ class Newcomer:
         cell: list[Any] = [choice.protocol, choice.cell, list(choice.inputs)]
         if choice.standing == PROVISIONAL:  # a version that another rule has refused stays refused
             cell += [PROVISIONAL, choice.authority]
-        content = json.dumps([seen, *cell, yaml.safe_load(self.machine_yaml)], sort_keys=True, default=str)
+        content = json.dumps([seen, *cell, yaml.load(self.machine_yaml, yaml.CSafeLoader)], sort_keys=True, default=str)
         return hashlib.sha256(content.encode()).hexdigest()
 
 

@@ -326,7 +326,7 @@ def write_case(case: Case, folder: Path) -> tuple[Path, Path]:
 
 def _machine_file(effect: Concealed | None) -> str:
     """The sample machine's file under another name, without the effect."""
-    plain = yaml.safe_load(sample_machine.FILE.read_text(encoding="utf-8"))
+    plain = yaml.load(sample_machine.FILE.read_bytes(), yaml.CSafeLoader)
     plain["machine"] = MACHINE
     if effect is not None:
         effect.forget(plain["twin"])

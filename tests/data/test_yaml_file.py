@@ -79,7 +79,8 @@ def bomb(levels: int) -> str:
         ("machine: !!int abc", "'abc' is no valid int"),
         ("machine: !!bool maybe", "'maybe' is no valid bool"),
         ("machine: !!timestamp soon", "'soon' is no valid timestamp"),
-        ("machine: a\0b", "not valid YAML (unacceptable character #x0000: special characters are not allowed in"),
+        ("machine: a\ud800", "not valid YAML ("),
+        ("machine: a\0b", "not valid YAML (unacceptable character #x0000: control characters are not allowed in"),
         ("machine: [" + 9000 * "a, " + "]\nchannels: {}", "'a', 'a', 'a'"),
     ],
 )
