@@ -270,11 +270,9 @@ def checks_and_forms_page() -> str:
 
 
 def cli_page() -> str:
-    import typer.main
+    from pipelines.cli import program
 
-    from pipelines.cli import app
-
-    root: Any = typer.main.get_command(app)
+    root = program()
     commands = list(_commands("thermodrift", root))
     lines = ["# Command line", "", NOTE, "", root.help, ""]
     lines += [

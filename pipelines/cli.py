@@ -6,8 +6,9 @@ from __future__ import annotations
 import errno
 import sys
 from collections.abc import Callable
+from functools import cache
 from importlib.metadata import entry_points
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -77,11 +78,17 @@ _DISK = {
 }  # fmt: skip
 
 
+@cache
+def program() -> Any:
+    """All commands with their options, for which every signature is read."""
+    return typer.main.get_command(app)
+
+
 def main() -> None:
     """Entry point: input errors are one line and exit code 2, failed work exit code 1, a stop 128 + signal."""
     try:
         with stopping.prompt():
-            code = app(standalone_mode=False)
+            code = program()(standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     except InputError as error:
         console.error(error)

@@ -6,10 +6,8 @@ import re
 import runpy
 import shlex
 import sys
-from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import pytest
 from documented import Block, Session, blocks, commands, differs
@@ -94,19 +92,11 @@ def _shown() -> list[Block]:
     return [b for page in PAGES for b in blocks(page) if b.language in ("", "sh", "console")]
 
 
-@cache
-def _program() -> Any:
-    """The commands; to make them takes tens of ms."""
-    import typer.main
-
-    from pipelines.cli import app
-
-    return typer.main.get_command(app)
-
-
 def _parameters(arguments: list[str]) -> list[str]:
     """What is wrong with a command line: an unknown command, an unknown option."""
-    command = _program()
+    from pipelines.cli import program
+
+    command = program()
     while getattr(command, "commands", None) and arguments and arguments[0] in command.commands:
         command, arguments = command.commands[arguments[0]], arguments[1:]
     if getattr(command, "commands", None) and not getattr(command, "invoke_without_command", False):
@@ -163,9 +153,11 @@ def test_every_registered_member_has_its_place_in_the_reference(build) -> None:
 
 
 def test_every_command_and_option_is_in_the_reference(build) -> None:
+    from pipelines.cli import program
+
     text = build.cli_page()
     sections = dict(re.findall(r"^## (thermodrift [\w -]+)\n(.*?)(?=^## |\Z)", text, flags=re.M | re.S))
-    for name, command in build._commands("thermodrift", _program()):
+    for name, command in build._commands("thermodrift", program()):
         assert all(f"`{o}`" in sections[name] for p in command.params for o in p.opts if o.startswith("-")), name
 
 
