@@ -19,7 +19,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 
 test: $(DEV)  ## every test without a marker
 	$(PYTEST) --dist loadfile -m "not slow and not integration"
 
-test-integration: $(DEV)  ## those with a browser, a server, a command as a process or a whole diagnosis
+test-integration: $(DEV)  ## those with a browser, a server, another process, a whole diagnosis or a real machine
 	$(PYTEST) --dist loadfile -m "integration and not slow"
 
 EXAM ?= exam/tests

@@ -78,7 +78,14 @@ def copied_stores(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
-ON_PREFECTS_SERVER = tuple(f"tests/pipelines/test_{n}.py" for n in ("flows", "diagnosis_flow", "retraining"))
+TOGETHER = {
+    # one of Prefect's servers, which takes half a minute to start
+    "tests/pipelines": ("flows", "diagnosis_flow", "retraining"),
+    # fits of the same small machines
+    "tests/diagnosis": (
+        "balance", "conclude", "diagnose", "fitted", "limits", "machine_size", "search", "swapped_labels",
+    ),
+}  # fmt: skip
 
 
 def pytest_runtest_setup() -> None:
@@ -89,14 +96,15 @@ def pytest_runtest_setup() -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """With --dist loadfile the files on Prefect's server share a process, since a server takes half a minute."""
+    """With --dist loadfile the files of TOGETHER share a process with those of their folder."""
     if config.getvalue("dist") != "loadfile":
         return None
     from xdist.scheduler import LoadFileScheduling
 
-    class OneServer(LoadFileScheduling):
+    class OneProcess(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
             file = super()._split_scope(nodeid)
-            return "on Prefect's server" if file in ON_PREFECTS_SERVER else file
+            folder, _, name = file.rpartition("/test_")
+            return folder if name.removesuffix(".py") in TOGETHER.get(folder, ()) else file
 
-    return OneServer(config, log)
+    return OneProcess(config, log)

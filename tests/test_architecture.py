@@ -153,6 +153,7 @@ def test_a_plant_names_nothing_of_the_twin(module: str) -> None:
     assert not {s for s in text if ":" in s and room_of(s.partition(":")[0]) in EVERY.keys() - PLANTS}
 
 
+@pytest.mark.integration
 def test_a_fresh_interpreter_with_all_plants_has_nothing_of_the_twin() -> None:
     every = sorted(m for m in MODULES if room_of(m) in PLANTS)
     done = subprocess.run(

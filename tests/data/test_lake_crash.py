@@ -127,6 +127,7 @@ def store_range(root: Path, who: str, go: Path) -> None:
         lake.quarantine(Path(__file__), "vmc", f"{who}{i}")
 
 
+@pytest.mark.integration
 def test_two_writers_at_once_lose_nothing(tmp_path: Path) -> None:
     root, go = tmp_path / "lake", tmp_path / "go"
     call = "store_range(t.Path({!r}), {!r}, t.Path({!r}))"

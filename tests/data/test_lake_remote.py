@@ -50,6 +50,7 @@ def test_what_cannot_be_reached_is_named_without_what_is_secret(address: str) ->
     assert "TOKEN" not in str(said.value) and "127.0.0.1" in str(said.value)
 
 
+@pytest.mark.integration
 def test_a_lake_on_s3(s3: str) -> None:
     """The small version of what the others do."""
     address = f"{s3}/lake-{uuid4().hex}"

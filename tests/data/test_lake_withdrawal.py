@@ -185,6 +185,7 @@ def crash_withdrawal(base: Path) -> None:
     crash_everywhere(base, lambda root: Lake(root).put_many([make("run1", seed=1), make("run2", seed=2)]), work)
 
 
+@pytest.mark.integration
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_kill_at_any_step_of_withdraw_and_purge_is_healed(tmp_path: Path) -> None:
     """Versions in use always load; the next write completes what was begun."""

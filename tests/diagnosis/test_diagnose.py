@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,61 +12,23 @@ import pytest
 
 from data.batch import Batch
 from data.errors import InputError
-from data.machine import Machine
 from diagnosis.contracts import COLUMNS
 from diagnosis.diagnose import diagnose
 from diagnosis.findings.schema import Findings
 from diagnosis.fitting.fitted import left_out_rows, rows_as_given, worsened
 from diagnosis.policy import POLICY
 from diagnosis.result import Diagnosis
-from tests.diagnosis.small_cases import DRIFT, runs, two_bodies
-from tests.twin.machines import TWO_BODIES, machine
-from tests.twin.recordings import drawn, empty_batches, recorded
+from tests.diagnosis.small_cases import runs, two_bodies
+from tests.diagnosis.whole import CASES, LAMP, PUMP, clamped, clamped_runs, diagnosed
+from tests.twin.recordings import empty_batches, recorded
 from twin.compile import compile_network
 from twin.schema import twin_part
 
-LAMP = {"law": "cabinet_heat", "into": "shaft", "parameters": {"heat": "100 W"}}
-PUMP = {"law": "cabinet_heat", "into": "head", "drivers": "vacuum", "parameters": {"heat": "14 W"}}
-PER_LEVEL_AND_KELVIN = {
-    "law": "free_flux", "into": "head", "at": {"body": "head"}, "drivers": {"level": "vacuum"},
-    "parameters": {"product": "6 W/K"},
-}  # fmt: skip
-
-
-def clamped(unit: str = "kPa", **changes: Any) -> Machine:
-    """Two bodies with a vacuum chuck, of which no listed law knows anything; in unit 1 some switched ones do."""
-    channels = {**TWO_BODIES["channels"], "vacuum": {"role": "driver", "unit": unit}}
-    return machine({**TWO_BODIES, "channels": channels}, **changes)
-
-
-def clamped_runs(hidden: dict[str, Any], count: int = 8, unit: str = "kPa", hours: float = 4.0) -> list[Batch]:
-    truth = clamped(unit, **{f"mechanisms__{k}": v for k, v in hidden.items()})
-    known, network = compile_network(clamped(unit)), compile_network(truth)
-    values = dict(zip((p.name for p in known.parameters), drawn(known, np.random.default_rng(1)), strict=True))
-    batches = []
-    for k, b in enumerate(empty_batches(clamped(unit), count, hours)):
-        first_s = 1200.0 + 1800.0 * (k % 4)
-        on = (b.time_s >= first_s) & ((b.time_s - first_s) % 14400.0 < 4800.0)  # once in 4 h
-        batches.append(replace(b, table=b.table.assign(vacuum=on.astype(float))))
-    return recorded(truth, batches, np.array([values.get(p.name, p.value) for p in network.parameters]), seed=1)
-
-
-CASES: dict[str, Callable[[], tuple[Machine, list[Batch]]]] = {
-    "consistent": lambda: (two_bodies(), runs(two_bodies())),
-    "explained": lambda: (two_bodies(), runs(two_bodies(), {"own": DRIFT}, count=8)),
-    "undecidable": lambda: (clamped("1"), clamped_runs({"own": PUMP}, 1, "1", hours=10.0)),
-    "unlisted": lambda: (clamped(), clamped_runs({"own": PER_LEVEL_AND_KELVIN})),
-    "partly_explained": lambda: (clamped(), clamped_runs({"own": PER_LEVEL_AND_KELVIN, "lamp": LAMP})),
-}
 LONGEST = pytest.param("partly_explained", marks=pytest.mark.slow)
 UNLISTED = pytest.param("unlisted", marks=pytest.mark.integration)
 UNDECIDABLE = pytest.param("undecidable", marks=pytest.mark.integration)
-VERDICTS = ["consistent", "explained", UNDECIDABLE, UNLISTED, LONGEST]
-
-
-@cache
-def diagnosed(verdict: str) -> Diagnosis:
-    return diagnose(*CASES[verdict]())
+EXPLAINED = pytest.param("explained", marks=pytest.mark.integration)
+VERDICTS = ["consistent", EXPLAINED, UNDECIDABLE, UNLISTED, LONGEST]
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
@@ -103,7 +63,7 @@ def test_no_channel_is_predicted_worse_than_before_or_than_by_the_file_as_given(
     assert not done.values or worsened(rows_as_given(done.search.baseline), after) == {}  # noqa: PD011 - no frame
 
 
-@pytest.mark.parametrize("verdict", ["explained", UNLISTED, LONGEST])
+@pytest.mark.parametrize("verdict", [EXPLAINED, UNLISTED, LONGEST])
 def test_with_what_was_found_only_noise_is_left(verdict: str) -> None:
     rms = diagnosed(verdict).findings.fit.left_out_rms
     for key, after in rms.after.items():
@@ -113,6 +73,7 @@ def test_with_what_was_found_only_noise_is_left(verdict: str) -> None:
     assert max(rms.before[k] / rms.after[k] for k in rms.after) > 3  # type: ignore[operator]
 
 
+@pytest.mark.integration
 def test_what_was_found_is_a_part_of_the_machine() -> None:
     done = diagnosed("explained")
     (found,) = done.findings.findings

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.processes import Processes
 from diagnosis.candidates.discretisation import never_reported, slack
@@ -21,26 +20,24 @@ from diagnosis.search import refits as refits_module
 from diagnosis.search import search as search_module
 from diagnosis.search.claims import Round
 from diagnosis.search.search import Search, decided, one_round, search, without
-from tests.diagnosis.small_cases import DRIFT, FLOOR, SHIFT, fitted, runs, two_bodies
+from tests.diagnosis.small_cases import DRIFT, FLOOR, SHIFT, consistent, fitted, runs, two_bodies
+from tests.diagnosis.whole import diagnosed
 from twin.calibration.identifiability import Interval, intervals90
 from twin.calibration.least_squares import result
 from twin.compile import compile_network
 from twin.quantity import Value
 
-COUNT = 8
 COLD = {**FLOOR, "parameters": {"conductance": "8 W/K"}}
 
 
 @cache
 def found(case: str) -> Search:
-    return search(fitted(two_bodies(), recordings(case)))
-
-
-def recordings(case: str) -> list[Batch]:
-    hidden: dict[str, Any] = {
-        "nothing": {}, "floor": {"a": COLD}, "drift": {"a": DRIFT}, "drift and shift": {"a": DRIFT, "b": SHIFT},
-    }[case]  # fmt: skip
-    return runs(two_bodies(), hidden, 6 if case == "floor" else COUNT)
+    if case in ("nothing", "drift"):
+        done = diagnosed("consistent" if case == "nothing" else "explained").search
+        assert done is not None
+        return done
+    hidden, count = ({"a": COLD}, 6) if case == "floor" else ({"a": DRIFT, "b": SHIFT}, 8)
+    return search(fitted(two_bodies(), runs(two_bodies(), hidden, count)))
 
 
 def names(done: Search) -> list[str]:
@@ -78,7 +75,7 @@ def test_a_claim_is_probable_and_no_channel_is_predicted_worse() -> None:
 def test_where_nothing_is_missing_nothing_is_accepted() -> None:
     done = found("nothing")
     assert len(done.rounds) == 1 and not done.accepted
-    assert done.final.part == done.baseline.part == fitted(two_bodies(), recordings("nothing")).part
+    assert done.final.part == done.baseline.part == consistent().part
     assert done.final.noise.factor.max() < 1.3
 
 
@@ -87,6 +84,7 @@ def test_nor_with_other_values_and_noise(seed: int) -> None:
     assert not search(fitted(two_bodies(), runs(two_bodies(), count=4, seed=seed))).accepted
 
 
+@pytest.mark.integration
 def test_a_drifting_sensor_is_the_sensors_fault() -> None:
     done = found("drift")
     assert names(done) == ["sensor_drift_t_head"]
@@ -115,6 +113,7 @@ def test_what_any_lumped_network_shows_is_not_tried(case: str) -> None:
         assert not {t.candidate.name for t in r.tried} & never_reported(proposed(r.before), r.before)
 
 
+@pytest.mark.integration
 def test_a_baseline_stays_where_without_the_effect_no_machine_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """Parameters gone with heat that feeds itself may make a machine that cannot be simulated without it."""
 
@@ -126,6 +125,7 @@ def test_a_baseline_stays_where_without_the_effect_no_machine_is(monkeypatch: py
     assert search_module._fair(r.before, r.tried).log_evidence >= r.before.log_evidence
 
 
+@pytest.mark.integration
 def test_what_a_refit_would_keep_without_its_effect_is_no_gain() -> None:
     """A fit before that has stopped short of its likeliest sizes and noise."""
     r = found("drift").rounds[0]
@@ -136,6 +136,7 @@ def test_what_a_refit_would_keep_without_its_effect_is_no_gain() -> None:
     assert again.best.gain == pytest.approx(r.best.gain, abs=2.0)
 
 
+@pytest.mark.integration
 def test_an_explanation_that_structure_drawn_anew_does_not_bear_out_is_not_claimed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -152,6 +153,7 @@ def test_an_explanation_that_structure_drawn_anew_does_not_bear_out_is_not_claim
     assert lost.confirmed and lost.gain == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.integration
 def test_what_was_grown_after_the_last_claim_is_judged_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
     r = found("drift").rounds[0]
     assert r.best is not None and r.figures is not None
@@ -164,6 +166,7 @@ def test_what_was_grown_after_the_last_claim_is_judged_no_further(monkeypatch: p
     assert done.final is r.best.fitted
 
 
+@pytest.mark.integration
 def test_what_was_not_confirmed_is_not_claimed(monkeypatch: pytest.MonkeyPatch) -> None:
     """After the last confirmation the best confirmed one stays, whatever others promise."""
     r = found("drift").rounds[0]
@@ -174,6 +177,7 @@ def test_what_was_not_confirmed_is_not_claimed(monkeypatch: pytest.MonkeyPatch) 
     assert any(t.gain > again.best.gain + 100.0 and not t.confirmed for t in again.tried)
 
 
+@pytest.mark.integration
 def test_where_no_twin_can_be_drawn_anew_a_claim_is_judged_by_its_own_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     def none(*_: Any) -> None:
         raise WorkError("no refined twin could be simulated")
@@ -203,6 +207,7 @@ def test_what_any_sensor_or_length_may_be_off_by_is_no_effect(sd: float) -> None
         assert refits_module._usual(c, fit, sizes) is (sd < POLICY.usual_error_sd), c.name  # type: ignore[arg-type]
 
 
+@pytest.mark.integration
 def test_what_was_accepted_can_be_taken_out_again() -> None:
     done = found("drift")
     best = done.accepted[0].best

@@ -15,6 +15,8 @@ from diagnosis.search.search import one_round
 from tests.diagnosis.concealed import Case, case, flux, shift
 from twin.schema import twin_part
 
+pytestmark = pytest.mark.integration  # a whole round of a search each
+
 
 def found(given: Case) -> Round:
     """The first round, on the terms of no list alone."""
@@ -38,7 +40,7 @@ def found(given: Case) -> Round:
         ),
         pytest.param(
             flux("bed", "rpm", "coolant", cross="0.012 W"), "bed", {"cross": 0.012},
-            "W into bed in proportion to rpm (at 5000 rpm) while coolant is on", marks=pytest.mark.integration,
+            "W into bed in proportion to rpm (at 5000 rpm) while coolant is on",
         ),
         pytest.param(
             flux("bed", "rpm", "coolant", square_cross="3e-6 W"), "bed", {"square_cross": 3e-6},
@@ -50,7 +52,6 @@ def found(given: Case) -> Round:
         ),
         pytest.param(
             shift("z", linear="8 um"), "z", {"linear": 8.0}, "µm of z while coolant is on",
-            marks=pytest.mark.integration,
         ),
         (shift("y", "column", "rpm", product="0.0005 um/K"), "y", {"product": 0.0005},
          "µm of y per K of column's rise, in proportion to rpm (at 5000 rpm)"),

@@ -115,6 +115,7 @@ def test_all_folds_at_once_are_the_folds_one_by_one(key: str, options: dict[str,
     assert family.fit_folds(design, []) == []
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("key", "library"), [("bp", "torch"), ("gru", "torch"), ("svr", "sklearn")])
 def test_a_trained_model_predicts_without_the_library_that_it_learned_with(
     key: str, library: str, tmp_path: Path

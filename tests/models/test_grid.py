@@ -86,6 +86,7 @@ def test_every_cell_once_and_baselines_once(grid) -> None:
     assert (lbo["family"] == "mlr").sum() == 1 + 6 + 6  # none, and 1 to 6 points of two selectors
 
 
+@pytest.mark.integration
 def test_results_do_not_depend_on_the_number_of_processes(grid) -> None:
     batches, results = grid
     two = run_grid(batches, ["z", "x"], QUICK, workers=2)

@@ -405,6 +405,7 @@ def test_served_without_thermodrift_it_predicts_the_same(year: Path, tmp_path: P
         Served(tmp_path).predict(table.assign(time_s=2 * table["time_s"]))
 
 
+@pytest.mark.integration
 def test_it_imports_nothing_of_thermodrift(year: Path, tmp_path: Path) -> None:
     stored = store_model(year, tmp_path)
     write_served(stored, tmp_path, 300.0)

@@ -66,6 +66,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPat
         dask_pools.open_cluster(f"tcp://127.0.0.1:{free_port()}", 1).__enter__()
 
 
+@pytest.mark.integration
 def test_the_cluster_listens_on_this_computer_alone(cluster: Any) -> None:
     import psutil
 
@@ -74,6 +75,7 @@ def test_the_cluster_listens_on_this_computer_alone(cluster: Any) -> None:
     assert len(found) >= 3 and set(found) == {"127.0.0.1"}
 
 
+@pytest.mark.integration
 def test_the_grid_on_workers_gives_the_same_numbers(cluster: Any) -> None:
     batches = make_toy_batches(4, 30)
     crossings = {"z": prepare(batches, "z", PLAN)}
@@ -103,12 +105,14 @@ def assert_same(got: FamilyResult, wanted: FamilyResult) -> None:
     assert bits[0] == bits[1]
 
 
+@pytest.mark.integration
 def test_a_worker_with_another_program_is_refused(cluster: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dask_pools, "_program", lambda: {"numpy": "0.1"})
     with pytest.raises(WorkError, match="a Dask worker has another version of numpy; install the same"):
         cluster.submit(len, "abc")()
 
 
+@pytest.mark.integration
 def test_what_the_work_raises_is_raised_here(cluster: Any) -> None:
     assert cluster.submit(len, "abc")() == 3
     with pytest.raises(InputError, match="--family: unknown value 'rigde': did you mean 'ridge'"):

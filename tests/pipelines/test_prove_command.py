@@ -54,6 +54,7 @@ def one_line(err: str) -> str:
     return last.removeprefix("thermodrift: ")
 
 
+@pytest.mark.integration
 def test_step_by_step(call: Call, asked: list[str], tmp_path: Path) -> None:
     proof = tmp_path / "proof"
     done = call("prove", "seal", *ASKED, "--out", proof)

@@ -245,6 +245,7 @@ def _lives(pid: int) -> bool:
         return False
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("what", ["check", "run"])
 def test_a_process_of_a_fleet_ends_with_the_one_that_started_it(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
     monkeypatch.setattr(scheduling, "APART", APART)
@@ -275,6 +276,7 @@ def test_turns_and_next_dates_are_kept(tmp_path: Path, said: list[str]) -> None:
     assert not again.source.due(datetime.now(UTC))
 
 
+@pytest.mark.integration
 def test_it_waits_in_little_memory() -> None:
     """The process that waits imports neither pandas nor mlflow, prefect or torch."""
     code = (

@@ -73,6 +73,7 @@ def test_a_missing_file_is_told(tmp_path):
         settings.load(tmp_path / "none.yml")
 
 
+@pytest.mark.integration
 def test_both_libraries_take_telemetry_as_off_and_prefect_lives_below_home(tmp_path):
     """Asked from the libraries themselves, in a process of its own."""
     code = (

@@ -63,6 +63,7 @@ def test_values_fit_the_machine_files_ranges_with_room_to_spare(tables: list[pd.
         assert channel.low <= everything[name].min() and everything[name].max() <= channel.high
 
 
+@pytest.mark.integration
 def test_same_seed_same_bytes_on_any_number_of_threads(tmp_path: Path) -> None:
     paths = write_sample_year(tmp_path / "a", 3, 4)
     code = (

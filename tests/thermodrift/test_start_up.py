@@ -13,6 +13,7 @@ import pytest
 import thermodrift as td
 from tests.toys.small_year import write_machine, write_year
 
+pytestmark = pytest.mark.integration
 HEAVY = {
     "asyncua", "distributed", "fastapi", "jinja2", "matplotlib", "mlflow", "multiprocessing", "numpy", "onnx",
     "openpyxl", "pandas", "paho", "pint", "prefect", "psycopg", "pyarrow", "pydantic", "ruamel", "scipy", "skfem",

@@ -62,6 +62,7 @@ def without_torch(folder: Path, *command: str) -> subprocess.CompletedProcess[st
     )  # fmt: skip
 
 
+@pytest.mark.integration
 def test_a_grid_runs_without_what_needs_torch(tmp_path: Path) -> None:
     write_machine(tmp_path / "small.yml", "small")
     write_year(tmp_path / "in")

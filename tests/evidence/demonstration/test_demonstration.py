@@ -76,6 +76,7 @@ def test_it_is_sealed_answered_opened_and_written(tmp_path: Path) -> None:
     assert "Not found: something was concealed, and no effect was named." in (out / "report.html").read_text("utf-8")
 
 
+@pytest.mark.integration
 def test_the_answering_process_sees_no_answer(case: tuple[Path, Machine]) -> None:
     diagnosis, isolation = answered(*case, by("curious"))
     assert "audit hook" in isolation
@@ -84,6 +85,7 @@ def test_the_answering_process_sees_no_answer(case: tuple[Path, Machine]) -> Non
     assert "THERMODRIFT_HOME" not in environment and place == "machine.yml recordings"
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("name", "words"),
     [
