@@ -124,12 +124,13 @@ def withheld() -> str:
     rows, about = table("diagnosis_withheld")
     concealed = rows["concealed"].map(lambda text: text.count("+") + 1)
     single, double = rows[concealed == 1], rows[concealed == 2]
+    machines = ", ".join(sorted(set(rows["kind"])))
     made_of = rows["claimed"].map(lambda text: len([name for name in text.split("; ") if name]))
     true = Share(int(rows["true"].sum()), int(made_of.sum()))
     both = Share(int((double["named"].astype(int) == 2).sum()), len(double))
     return (
-        f"{len(rows)} cases of real recordings ({', '.join(sorted(set(rows['kind'])))}), used in the development, whose "
-        f"machine file lacks what it is known to need, version {about['version']}: what is missing is named in "
+        f"{len(rows)} cases of real recordings ({machines}), used in the development, whose machine file "
+        f" lacks what it is known to need, version {about['version']}: what is missing is named in "
         f"{Share(int((single['named'].astype(int) > 0).sum()), len(single))} cases of one, both in {both} of two; "
         f"{true} claims true."
     )
