@@ -130,7 +130,7 @@ def withheld() -> str:
     both = Share(int((double["named"].astype(int) == 2).sum()), len(double))
     return (
         f"{len(rows)} cases of real recordings ({machines}), used in the development, whose machine file "
-        f" lacks what it is known to need, version {about['version']}: what is missing is named in "
+        f"lacks what it is known to need, version {about['version']}: what is missing is named in "
         f"{Share(int((single['named'].astype(int) > 0).sum()), len(single))} cases of one, both in {both} of two; "
         f"{true} claims true."
     )
