@@ -63,7 +63,7 @@ lock: $(RUN)  ## renew both lock files within the ranges of pyproject.toml
 	(echo "# What the program needs, with all that this needs, within pyproject.toml's ranges; \`make lock\` renews it."; \
 	 $(RESOLVE) -e . setuptools uv | $(PINS)) > .venv/new.lock && mv .venv/new.lock requirements.lock
 	(echo "# What tests, lint, examination, documentation and extras need beyond requirements.lock; \`make lock\` renews it."; \
-	 $(RESOLVE) -c requirements.lock -e '.[dev]' -e ./exam | $(PINS) | grep -vxFf requirements.lock) \
+	 $(RESOLVE) -c requirements.lock -e '.[dev]' -e './exam[proof]' | $(PINS) | grep -vxFf requirements.lock) \
 	 > .venv/new.lock && mv .venv/new.lock requirements-dev.lock
 
 # What is imported is compiled at its first use: compiling every module of every package takes a third of the set-up.
@@ -84,14 +84,13 @@ define locked
 	$(INSTALL) -c requirements.lock -r $(1)
 endef
 
-$(RUN): requirements.lock pyproject.toml
+$(RUN): requirements.lock pyproject.toml exam/pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if v == (3, 11) else f"thermodrift needs Python 3.11, got {v[0]}.{v[1]}; call make PYTHON=/path/to/python3.11")'
 	$(PYTHON) -m venv .venv
 	$(call locked,requirements.lock)
-	$(EDITABLE) .
+	$(EDITABLE) . -e ./exam
 	@touch $@
 
-$(DEV): requirements-dev.lock exam/pyproject.toml $(RUN)
+$(DEV): requirements-dev.lock $(RUN)
 	$(call locked,requirements-dev.lock)
-	$(EDITABLE) ./exam
 	@touch $@

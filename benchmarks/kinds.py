@@ -46,10 +46,10 @@ from diagnosis.fitting.fitted import baseline
 from diagnosis.result import Diagnosis
 from diagnosis.search.claims import Round, alike
 from diagnosis.search.search import one_round
-from evidence.scoring.answer_key import AnswerKey, Spot
-from evidence.scoring.matching import names_term
 from thermodrift_exam.plants.plant import Case
 from thermodrift_exam.plants.withheld import CASES, build, cases
+from thermodrift_exam.proof.scoring.answer_key import AnswerKey, Spot
+from thermodrift_exam.proof.scoring.matching import names_term
 from thermodrift_exam.proof.scoring.true_model import TrueModel, true_model
 from thermodrift_exam.proof.spec import KIND_PLANTS, CaseSpec, Kind, PlantKind
 from thermodrift_exam.proof.suite.build import answer_of

@@ -16,7 +16,6 @@ from data.errors import InputError, WorkError, place_of
 from pipelines import console, stopping
 from pipelines.commands.calibrate import calibrate
 from pipelines.commands.compensate import compensate, export, rehearse
-from pipelines.commands.demonstrate import demonstrate
 from pipelines.commands.describe import describe
 from pipelines.commands.diagnose import diagnose
 from pipelines.commands.ingest import ingest
@@ -40,7 +39,7 @@ app = typer.Typer(
 )
 COMMANDS: tuple[Callable[..., None], ...] = (
     describe, ingest, train, report, promote, rollback, status, registry, predict, rehearse, compensate, export,
-    schedule, simulate, calibrate, diagnose, demonstrate,
+    schedule, simulate, calibrate, diagnose,
 )  # fmt: skip
 for command in COMMANDS:
     app.command()(command)

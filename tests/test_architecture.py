@@ -22,18 +22,16 @@ ALLOWED: Mapping[str, set[str]] = {
     "plants": {"data"},
     "compensation": {"data", "features", "models", "twin"},
     "reports": {"data", "features", "models", "twin", "diagnosis", "compensation"},
-    "evidence": {"data", "features", "models", "twin", "diagnosis", "plants", "reports"},
-    "pipelines": {"data", "features", "models", "twin", "compensation", "diagnosis", "plants", "reports", "evidence"},
+    "pipelines": {"data", "features", "models", "twin", "compensation", "diagnosis", "plants", "reports"},
     "thermodrift": {
-        "data", "features", "models", "twin", "compensation", "diagnosis", "plants", "reports", "evidence", "pipelines",
+        "data", "features", "models", "twin", "compensation", "diagnosis", "plants", "reports", "pipelines",
     },
 }  # fmt: skip
 EXAM: Mapping[str, set[str]] = {  # a distribution of its own, which no room of the product may import
     "thermodrift_exam.plants": {"data", "plants"},
     "thermodrift_rivals": {"data", "twin", "diagnosis"},  # the answering process reads it, and nothing else of exam/
     "thermodrift_exam": {
-        "data", "features", "models", "twin", "diagnosis", "plants", "reports", "evidence", "pipelines",
-        "thermodrift_exam.plants",
+        "data", "features", "models", "twin", "diagnosis", "plants", "reports", "pipelines", "thermodrift_exam.plants",
     },
 }  # fmt: skip
 EVERY = {**ALLOWED, **EXAM}

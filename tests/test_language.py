@@ -41,7 +41,7 @@ INSTEAD: Mapping[str, str] = {  # regular expression, in lower case -> preferred
 WORDS = {re.compile(rf"\b(?:{pattern})(?!\w)", re.IGNORECASE): instead for pattern, instead in INSTEAD.items()}
 PAGES = [*(ROOT / n for n in ("README.md", "CONTRIBUTING.md", "SECURITY.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 ROOMS = (
-    "compensation", "data", "diagnosis", "evidence", "features", "models", "pipelines", "plants", "reports",
+    "compensation", "data", "diagnosis", "features", "models", "pipelines", "plants", "reports",
     "thermodrift", "twin",
 )  # fmt: skip
 

@@ -60,7 +60,6 @@ _ROOMS = (
     "diagnosis",
     "plants",
     "reports",
-    "evidence",
     "pipelines",
 )
 

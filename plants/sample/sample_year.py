@@ -227,7 +227,8 @@ def write_sample_year(folder: Path, seed: int = 0, batches: int = 30) -> list[Pa
             errors = {
                 k: v[rows, b] + probe.normal(0.0, PROBE_NOISE_UM, len(v[rows, b])) for k, v in truth.error_um.items()
             }
-            text = _csv(plan, seed, temperatures, truth.speed_rpm[rows, b], errors)
+            head = f"thermodrift sample year, seed {seed}"
+            text = csv_text(head, plan, temperatures, truth.speed_rpm[rows, b], errors)
             path = folder / plan.name
             path.write_text(text, encoding="ascii", newline="\n")
             paths.append(path)
@@ -241,14 +242,15 @@ def _stepped(values: Array, step: float) -> Array:
     return np.asarray(np.rint(values / step) * step + 0.0)
 
 
-def _csv(
-    plan: Plan, seed: int, temperatures: Mapping[str, Array], speed_rpm: Array, errors: Mapping[str, Array]
+def csv_text(
+    head: str, plan: Plan, temperatures: Mapping[str, Array], speed_rpm: Array, errors: Mapping[str, Array]
 ) -> str:
+    """A recording with a row per minute, rounded as by the instruments; its first line calls it simulated."""
     columns = [
         [f"{plan.start + timedelta(seconds=k * SAMPLE_S):%Y-%m-%d %H:%M:%S}" for k in range(len(speed_rpm))],
         *([f"{v:.1f}" for v in _stepped(temperatures[n], TEMPERATURE_STEP_K)] for n in SENSOR_OFFSET_K),
         [f"{v:.0f}" for v in speed_rpm],
         *([f"{v:.0f}" for v in _stepped(errors[n], PROBE_STEP_UM)] for n in ("x", "y", "z")),
     ]
-    head = [f"# simulated recording, thermodrift sample year, seed {seed}", ",".join(COLUMNS)]
-    return "\n".join([*head, *(",".join(row) for row in zip(*columns, strict=True))]) + "\n"
+    lines = [f"# simulated recording, {head}", ",".join(COLUMNS)]
+    return "\n".join([*lines, *(",".join(row) for row in zip(*columns, strict=True))]) + "\n"

@@ -16,7 +16,6 @@ from data.errors import InputError
 from data.machine import Machine, parse_machine
 from data.peek import look
 from data.recording import read_batches, recording_files
-from thermodrift_exam.plants.types.lathe_axis import write_sample_axis
 
 
 def run(seed: int, n: int = 400) -> pd.DataFrame:
@@ -355,19 +354,6 @@ def test_rows_that_share_a_stamp_are_a_sweep(tmp_path: Path) -> None:
     assert (machine.recording.step_s, machine.recording.max_gap_s) == (10, 9000)  # 12 rows in two minutes
     at, error = sweeps_of(tmp_path / "a.csv", machine, "deviation")
     assert np.allclose(at, AT_MM) and np.allclose(error, error_um(SWEEPS_MIN))
-
-
-def test_readings_with_stamps_of_their_own_in_a_log(tmp_path: Path) -> None:
-    (path,) = write_sample_axis(tmp_path, 0, 1)
-    table = pd.read_csv(path, skiprows=1)
-    table = table.rename(columns={"x_axis": "x_error", "z_axis": "z_error", "x_spindle": "dx", "z_spindle": "dz"})
-    text, machine, _ = draft_of(tmp_path, table)
-    assert machine.channels["x_error"].position == "x_position" and machine.channels["z_error"].position == "z_position"
-    assert machine.channels["dx"].position is None
-    assert "position: x_position  # guessed: error and position stand in the same rows" in text
-    assert machine.recording.step_s == 10
-    at, _ = sweeps_of(tmp_path / "a.csv", machine, "z_error")
-    assert (at == at[0]).all()
 
 
 @pytest.mark.parametrize("pattern", ["x={:g}", "X = {:.1f} mm", "Ex @{:g}", "z {:g}", "dev at {:g}mm"])

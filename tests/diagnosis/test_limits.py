@@ -17,7 +17,6 @@ from diagnosis.fitting.fitted import under
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, limits, one_of_each, proposed, screen
 from tests.diagnosis.small_cases import DRIFT, FLOOR, SHIFT, consistent, fitted, runs, two_bodies
-from thermodrift_exam.plants.kinds import draw_kind_case
 from twin.mechanisms import MECHANISMS
 
 THRESHOLD = 25.0
@@ -134,15 +133,3 @@ def test_what_absorbs_it_is_named_where_much_is_absorbed() -> None:
         assert (row.absorbed_by in free) if row.absorbed > 0.3 else row.absorbed_by == ""
     head = table()[(table()["mechanism"] == "natural_convection") & (table()["name"] == "head")].iloc[0]
     assert head["absorbed"] > 0.9 and head["absorbed_by"] in free
-
-
-@pytest.mark.parametrize(("driver", "expected"), [("1", "W"), ("%", "W/%")])
-def test_a_heat_per_unit_of_its_driver_says_so(driver: str, expected: str) -> None:
-    """Of a heater in per cent plain watts would be off by a hundred; waste heat may follow a driver or none."""
-    case = draw_kind_case(3, "board", {}, runs=4)
-    heaters = {n: case.machine.channels[n].model_copy(update={"unit": driver}) for n in case.machine.names("driver")}
-    known = case.machine.model_copy(update={"channels": {**case.machine.channels, **heaters}})
-    done = fitted(known, case.batches)
-    heats = [c for c in proposed(done) if c.mechanism in ("electrical_heat", "cabinet_heat")]
-    units = limits(done, screen(done, heats), THRESHOLD).groupby("mechanism")["unit"].agg(set)
-    assert units.to_dict() == {"electrical_heat": {expected}, "cabinet_heat": {"W", expected}}

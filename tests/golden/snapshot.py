@@ -30,15 +30,10 @@ from data.lake import Lake
 from data.machine import Machine, load_machine
 from diagnosis.diagnose import diagnose
 from diagnosis.findings.schema import as_json
-from evidence.sealing.examinee import read_case
 from models.families import FAMILIES
 from models.selection.crossing import Plan
 from models.selection.grid import run_grid
 from plants.sample.sample_year import write_sample_year
-from thermodrift_exam.proof.spec import CaseSpec
-from thermodrift_exam.proof.suite import build, small_suite, write_built
-from thermodrift_exam.studies import STUDIES
-from thermodrift_exam.studies.base import run_studies
 from twin.calibration import CalibrationOptions, calibrate
 from twin.compile import compile_network
 from twin.run_plan import load_run_plan
@@ -88,8 +83,11 @@ def calibration() -> Any:
 
 def findings() -> Any:
     """findings.json of eight cases: two with nothing missing, four with one effect, one with two, one unlisted."""
+    from thermodrift_exam.proof.sealing.examinee import read_case
+    from thermodrift_exam.proof.suite import build, small_suite, write_built
+
     out = {}
-    for spec in _cases():
+    for spec in _cases(small_suite()):
         with tempfile.TemporaryDirectory() as folder:
             write_built(build(spec), Path(folder) / "case")
             machine, batches = read_case(Path(folder) / "case", Path(folder) / "lake")
@@ -101,6 +99,9 @@ def findings() -> Any:
 
 def studies() -> Any:
     """The figures of the five published studies at two seeds."""
+    from thermodrift_exam.studies import STUDIES
+    from thermodrift_exam.studies.base import run_studies
+
     return {key: _table(result.table) for key, result in run_studies(list(STUDIES), seeds=2, workers=2).items()}
 
 
@@ -166,8 +167,8 @@ def _held() -> dict[str, Any]:
     return held
 
 
-def _cases() -> list[CaseSpec]:
-    nothing, drift, cabinet, pump, two, unlisted = small_suite()
+def _cases(small: Sequence[Any]) -> list[Any]:
+    nothing, drift, cabinet, pump, two, unlisted = small
     other = replace(nothing, plant="elements", seed=nothing.seed + 1)
     shift = replace(cabinet, effects={"speed_shift": 2.0}, seed=cabinet.seed + 1)
     every = (nothing, other, drift, cabinet, pump, shift, two, unlisted)

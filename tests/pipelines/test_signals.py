@@ -9,6 +9,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -105,6 +106,7 @@ ARGUMENTS: dict[str, Callable[[Path], list[object]]] = {
                             g / f"drafted{time.monotonic_ns()}.yml"],
 }  # fmt: skip
 OF_PROMOTED = {"compensate", "rehearse"}
+OF_EXAM = {"demonstrate", "reproduce"}  # commands of another distribution
 TERM, INT = signal.SIGTERM, signal.SIGINT
 MAKING_STORE = printed("first use")
 CASES: list[tuple[str, str, Moment, int]] = [
@@ -152,6 +154,8 @@ SMALL = ("train workers", "workers start")
 def parameters() -> Iterator[object]:
     for name, moment, when, number in CASES:
         marks = [] if (name, moment) == SMALL else [pytest.mark.slow]
+        if name in OF_EXAM and not entry_points(group="thermodrift.commands", name=name):
+            continue
         yield pytest.param(name, when, number, id=f"{name}-{moment}-{signal.Signals(number).name}", marks=marks)
 
 

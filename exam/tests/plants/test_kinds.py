@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from data.checks import check_machine, checked
 from data.errors import InputError
+from diagnosis.screening.screen import limits, proposed, screen
+from tests.diagnosis.small_cases import fitted
 from thermodrift_exam.plants.kinds import KINDS, draw_kind_case, effects_of, execute, unlisted_of
 from thermodrift_exam.plants.kinds.case import KindPosed, all_effects, made, posed, variants
 from thermodrift_exam.plants.kinds.effects.base import lagged
@@ -264,3 +267,22 @@ def test_sizes_of_two_seeds_differ_widely() -> None:
     heavy = [float(p.solid.capacity_J_per_K[p.bodies["motor"]].sum()) for p in drawn]
     assert max(heavy) > 2.0 * min(heavy)
     assert len({frozenset(p.bodies) for p in drawn}) > 3
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_no_row_of_a_sound_plant_is_masked(kind: str) -> None:
+    case = draw_kind_case(1, kind, {}, runs=8)
+    known = check_machine([checked(b, case.machine) for b in case.batches], case.machine)
+    assert [f.message for b in known for f in b.findings if f.masks] == []
+
+
+@pytest.mark.parametrize(("driver", "expected"), [("1", "W"), ("%", "W/%")])
+def test_a_heat_per_unit_of_its_driver_says_so(driver: str, expected: str) -> None:
+    """Of a heater in per cent plain watts would be off by a hundred; waste heat may follow a driver or none."""
+    case = draw_kind_case(3, "board", {}, runs=4)
+    heaters = {n: case.machine.channels[n].model_copy(update={"unit": driver}) for n in case.machine.names("driver")}
+    known = case.machine.model_copy(update={"channels": {**case.machine.channels, **heaters}})
+    done = fitted(known, case.batches)
+    heats = [c for c in proposed(done) if c.mechanism in ("electrical_heat", "cabinet_heat")]
+    units = limits(done, screen(done, heats), 25.0).groupby("mechanism")["unit"].agg(set)
+    assert units.to_dict() == {"electrical_heat": {expected}, "cabinet_heat": {"W", expected}}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,8 +19,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from rich.table import Table
 
-    from evidence.sealing.running import Examinee
     from thermodrift_exam.proof.proving import ProofOutcome, ProofRequest
+    from thermodrift_exam.proof.sealing.running import Examinee
 
 
 def proof_dict(outcome: ProofOutcome) -> dict[str, Any]:
@@ -107,6 +108,8 @@ def prove(
     as_json: Json = False,
 ) -> None:
     """Examine the diagnosis on concealed effects: seal, run and open in one go, or step by step."""
+    if find_spec("skfem") is None:
+        raise InputError("prove: package scikit-fem is not installed; run pip install 'thermodrift-exam[proof]'")
     if context.invoked_subcommand is not None:
         return
     from thermodrift_exam.proof.proving import prove as prove_all

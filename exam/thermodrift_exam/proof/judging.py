@@ -17,16 +17,16 @@ from data.errors import InputError, WorkError
 from data.machine import Machine
 from data.processes import Processes
 from diagnosis.findings.schema import Findings, read_findings
-from evidence.sealing.examinee import FINDINGS, PLAN, read_case
-from evidence.sealing.folder import ProofFolder, files_digest, read_json, source_digest, write_json
-from evidence.sealing.isolation import own_source
-from evidence.sealing.running import RUN, Examinee, examine
-from evidence.sealing.seal import Done
+from thermodrift_exam.proof.sealing.examinee import FINDINGS, PLAN, read_case
+from thermodrift_exam.proof.sealing.folder import ProofFolder, files_digest, read_json, source_digest, write_json
+from thermodrift_exam.proof.sealing.isolation import roots
 from thermodrift_exam.proof.sealing.opening import Opened
+from thermodrift_exam.proof.sealing.running import RUN, Examinee, examine
+from thermodrift_exam.proof.sealing.seal import Done
 from thermodrift_exam.proof.spec import KIND_PLANTS
 
 if TYPE_CHECKING:
-    from evidence.scoring.answer_key import Stored
+    from thermodrift_exam.proof.scoring.answer_key import Stored
     from thermodrift_exam.proof.scoring.true_model import TrueModel
 
 
@@ -109,7 +109,7 @@ def judge(case: Path, answer: Path, kept: Path, again: Path, key: Mapping[str, A
 
     `again` is the folder with the findings after the proposed run.
     """
-    from evidence.scoring.answer_key import read_stored
+    from thermodrift_exam.proof.scoring.answer_key import read_stored
 
     with threadpool_limits(limits=1), tempfile.TemporaryDirectory(prefix="thermodrift-") as lake:
         machine, batches = read_case(case, Path(lake))
@@ -159,5 +159,5 @@ def truth_from_json(plain: Mapping[str, Any] | None) -> TrueModel | None:
 
 def scoring_source() -> str:
     """Digest of the source that scores an answer."""
-    root, _ = own_source()
+    root, _ = roots()
     return files_digest(root, sorted(f for part in ("data", "twin") for f in (root / part).rglob("*.py")))

@@ -12,11 +12,11 @@ from typing import Any, Literal, get_args
 import pandas as pd
 
 from data.errors import InputError, WorkError
-from evidence.sealing.folder import ProofFolder, files_digest, state_of
-from evidence.sealing.running import LIMIT_S, Examinee, RunOutcome, run
-from evidence.sealing.seal import Done, Suite, seal
 from thermodrift_exam.proof.report.tables import ProofRun
+from thermodrift_exam.proof.sealing.folder import ProofFolder, files_digest, state_of
 from thermodrift_exam.proof.sealing.opening import unseal
+from thermodrift_exam.proof.sealing.running import LIMIT_S, Examinee, RunOutcome, run
+from thermodrift_exam.proof.sealing.seal import Done, Suite, seal
 from thermodrift_exam.proof.spec import CENTRES, PLANT_KINDS, REAL, CaseSpec, PlantKind
 
 Which = Literal["development", "sealed"]
@@ -124,7 +124,7 @@ def run_proof(
     """Answer every case that has no answer yet.
 
     Raises:
-        InputError, WorkError: as `evidence.sealing.running.run`.
+        InputError, WorkError: as `thermodrift_exam.proof.sealing.running.run`.
     """
     return run(ProofFolder(out), by or examinee(), workers, restart, done)
 

@@ -9,12 +9,12 @@ from typing import Any
 import pandas as pd
 
 from data.registry import Registry
-from evidence.sealing.folder import Entry, ProofFolder
 from thermodrift_exam.proof.judging import Judged
 from thermodrift_exam.proof.report.tables import TABLES, ProofRun
 from thermodrift_exam.proof.scoring.goal_table import goal_table, reliability
 from thermodrift_exam.proof.scoring.outcomes import outcomes
 from thermodrift_exam.proof.scoring.tables import claims, compared, confusion, missed, worst
+from thermodrift_exam.proof.sealing.folder import Entry, ProofFolder
 from thermodrift_exam.proof.sealing.opening import Opened
 
 OF_CASES = ("started", "answered", "interrupted", "void")  # steps of the ledger that are counted, not listed

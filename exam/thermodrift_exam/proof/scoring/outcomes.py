@@ -12,8 +12,8 @@ import numpy as np
 import pandas as pd
 
 from diagnosis.findings.schema import Finding, Findings
-from evidence.scoring.answer_key import AnswerKey, Stored, TrueTerm
-from evidence.scoring.matching import (
+from thermodrift_exam.proof.scoring.answer_key import AnswerKey, Stored, TrueTerm
+from thermodrift_exam.proof.scoring.matching import (
     UNLISTED,
     Matches,
     always,

@@ -11,9 +11,9 @@ import pandas as pd
 
 from data.errors import InputError
 from diagnosis.findings.schema import SCHEMA, Findings
-from evidence.scoring.answer_key import AnswerKey, Stored
-from evidence.scoring.matching import matches
+from thermodrift_exam.proof.scoring.answer_key import AnswerKey, Stored
 from thermodrift_exam.proof.scoring.goals import ONE, bootstrap, clopper_pearson
+from thermodrift_exam.proof.scoring.matching import matches
 from thermodrift_exam.proof.scoring.outcomes import NOTHING, outcomes, visible_physics
 from thermodrift_exam.proof.scoring.true_model import TrueModel
 

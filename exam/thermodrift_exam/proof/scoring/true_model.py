@@ -27,8 +27,8 @@ from diagnosis.fitting.batches import enough_batches, usable_batches
 from diagnosis.fitting.fitted import afresh, baseline, left_out_rows, refitted
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, proposed, screen
-from evidence.scoring.answer_key import AnswerKey, Spot, TrueTerm
-from evidence.scoring.matching import Sized, counted_as, exact, sized
+from thermodrift_exam.proof.scoring.answer_key import AnswerKey, Spot, TrueTerm
+from thermodrift_exam.proof.scoring.matching import Sized, counted_as, exact, sized
 from twin.calibration.identifiability import Interval, intervals90
 from twin.calibration.least_squares import result
 from twin.compile import compile_network

@@ -1,1 +1,1 @@
-"""Opening a sealed proof, and what its names and sizes alone give away."""
+"""Sealing cases, answering them in isolation, opening them, and what their names and sizes alone give away."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from data.errors import InputError
-from evidence.sealing.folder import (
+from thermodrift_exam.proof.sealing.folder import (
     Entry,
     ProofFolder,
     State,
@@ -19,8 +19,8 @@ from evidence.sealing.folder import (
     state_of,
     write_json,
 )
-from evidence.sealing.running import check_case
-from evidence.sealing.seal import names_of
+from thermodrift_exam.proof.sealing.running import check_case
+from thermodrift_exam.proof.sealing.seal import names_of
 
 UNANSWERED = "it had no answer when the proof was opened"
 LOST = "an answer is there that no run recorded"

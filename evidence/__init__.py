@@ -1,1 +1,0 @@
-"""Evidence: the sealed examination of the diagnosis, and published studies reproduced."""
