@@ -39,7 +39,7 @@ for path, command in tree:
     done = CliRunner().invoke(app, [*path, "--help"])
     assert done.exit_code == 0 and "Usage: " in done.output, (path, done.output)
     assert path != ("train",) or "--direct" in done.output
-assert len(tree) > 25
+assert len(tree) > 20
 {SHOW}
 """
 

@@ -11,6 +11,7 @@ import pytest
 from data.machine import load_machine
 from diagnosis.findings.schema import Findings, FitSummary, as_json
 from tests.toys.command import Call, in_process
+from thermodrift_exam.commands import prove
 from thermodrift_exam.proof import judging as proof_judging
 from thermodrift_exam.proof.scoring.true_model import TrueModel
 from thermodrift_exam.proof.sealing import running
@@ -126,3 +127,12 @@ def test_bad_input_is_one_line(
     done = call("prove", *args)
     assert done.code == 2 and words in one_line(done.err)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_without_its_extra_it_says_what_to_install(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(prove, "find_spec", lambda name: None)
+    done = call("prove", "seal", *ASKED, "--out", "p")
+    assert (done.code, done.out) == (2, "")
+    assert one_line(done.err) == (
+        "prove: package scikit-fem is not installed; run pip install 'thermodrift-exam[proof]'"
+    )
