@@ -8,9 +8,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 from urllib.parse import urlparse
 
-import paho.mqtt.client as mqtt
-
-from compensation.connectors.mqtt import prompt_socket
+from compensation.connectors.mqtt import prompt_client
 from compensation.contracts import Correction, Sample
 from data.errors import WorkError
 
@@ -30,8 +28,7 @@ class MqttExchange:
         self._answers: SimpleQueue[dict[str, Any]] = SimpleQueue()
         self._ready: SimpleQueue[bool] = SimpleQueue()
         self._heard = False
-        self._client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
-        self._client.on_socket_open = prompt_socket
+        self._client = prompt_client()
         self._client.on_connect = lambda client, *_: client.subscribe(f"{self.prefix}/correction", 1)
         self._client.on_subscribe = lambda *_: self._ready.put(True)
         self._client.on_message = lambda _, __, message: self._answers.put(json.loads(message.payload))

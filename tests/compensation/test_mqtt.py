@@ -92,6 +92,7 @@ class Control:
 
     def __init__(self, port: int) -> None:
         self.got: dict[str, str] = {}
+        self.order: list[str] = []
         self._subscribed = False
         self._client = Client(CallbackAPIVersion.VERSION2)
         self._client.on_message = self._on_message
@@ -102,7 +103,8 @@ class Control:
         eventually(lambda: self._subscribed, "the control is not subscribed")
 
     def _on_message(self, client: Client, userdata: object, message: MQTTMessage) -> None:
-        self.got[message.topic.removeprefix("hall/mill/")] = message.payload.decode(errors="replace")
+        self.order.append(message.topic.removeprefix("hall/mill/"))
+        self.got[self.order[-1]] = message.payload.decode(errors="replace")
 
     def _on_subscribe(self, *_: object) -> None:
         self._subscribed = True
@@ -239,6 +241,8 @@ def test_a_correction_arrives_as_json_and_as_plain_numbers(broker: Broker, contr
         **record, "reasons": {}, "heartbeat": 0, "valid_until_s": 0.0,
     }  # fmt: skip
     assert control.got["heartbeat"] == "0"
+    numbers = [f"correction/z/{key}" for key in ("offset_um", "slope_um_per_m", "state")]
+    assert control.order == ["correction", *numbers, "heartbeat", "state"]
     assert float(control.got["correction/z/offset_um"]) == -12.25
     assert float(control.got["correction/z/slope_um_per_m"]) == 3.5
     assert control.got["correction/z/state"] == "active"
@@ -252,6 +256,23 @@ def test_a_correction_arrives_as_json_and_as_plain_numbers(broker: Broker, contr
     late.close()
     with pytest.raises(WorkError, match="closed"):
         sink.write(CORRECTION)
+
+
+@pytest.mark.skipif(not hasattr(socket, "TCP_QUICKACK"), reason="needs Linux")
+def test_neither_side_waits_for_tcp(broker: Broker, machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    plain = socket.socket.setsockopt
+
+    def noted(self: socket.socket, level: int, option: int, value: int) -> None:
+        asked.extend([option] if level == socket.IPPROTO_TCP else [])
+        plain(self, level, option, value)
+
+    monkeypatch.setattr(socket.socket, "setsockopt", noted)
+    sink = open_sink(broker.address, machine)
+    sink.write(CORRECTION)
+    eventually(lambda: asked.count(socket.TCP_QUICKACK) == 6, "a receipt is not acknowledged at once")  # 6 topics
+    assert asked[0] == socket.TCP_NODELAY
+    sink.close()
 
 
 def test_the_last_will_says_off_when_the_compensator_is_lost(broker: Broker, control: Control) -> None:
