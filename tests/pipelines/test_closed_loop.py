@@ -58,4 +58,4 @@ def test_a_plant_is_compensated_through_a_broker(broker: Broker, tmp_path: Path)
     assert told["samples"] == 181
     for name, value in own["axes"]["z"].items():
         assert told["axes"]["z"][name] == pytest.approx(value, rel=1e-6), name
-    assert json.loads((tmp_path / "state.json").read_text())["machine"] == "mill"
+    assert json.loads((tmp_path / "state.json").read_text())["state"]["machine"] == "mill"
