@@ -44,6 +44,7 @@ from diagnosis.fitting.fitted import (
     baseline,
     check,
     harms,
+    lead_of,
     left_out_rows,
     on_all_rows,
     plain,
@@ -103,6 +104,9 @@ def diagnose(
         remarks += more
         fitted = baseline(machine, part, batches, tell, len(recordings), seed)
         done = search(fitted, workers, tell)
+        if done.accepted and (lead_rows := lead_of(machine, done.final.part, batches)) != fitted.lead_rows:
+            # what was missing had passed for drivers that act at another time
+            done = search(baseline(machine, part, batches, tell, len(recordings), seed, lead_rows), workers, tell)
         tell("left out", 0, 0)
         first = _located(done.baseline, done.baseline.batches)
     located: dict[str, pd.DataFrame] = {}

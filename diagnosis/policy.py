@@ -133,7 +133,9 @@ class Policy:
     screen_amplitude_noises: float = physical(10.0, "given noises", "sd of a signature in the channel it changes most")
     screened_scales: int = cost(3, "scales of structure", "the likeliest without an effect and smaller ones")
     refit_min_gain_share: float = development(
-        0.5, "of what growth needs", "of 76 refits that grew, 72 were promised as much; no lost one was right"
+        0.12,
+        "of what a claim needs",
+        "of 76 refits with a quarter of that, 72 were promised this; no other was right",
     )
     unlisted_term_cost_nats: float = analytic(1.0, "nats", "of what gains alike a listed law comes first")
     run_windows: int = cost(12, "parts of a run", "in which what happens once is looked for")
@@ -158,7 +160,6 @@ class Policy:
         4.82, "log odds", "a logistic fit of 99 claims of first rounds, 36 of them right: results/claims.csv"
     )
     claim_weight: float = development(1.31, "log odds", "of the same fit, for the logarithm of the relative gain")
-    grown_min_probability: float = cost(0.25, "probability", "of an effect with which the next is looked for")
     claim_min_probability: float = convention(
         0.7, "probability", "a false claim costs more than twice as much as a missed one"
     )

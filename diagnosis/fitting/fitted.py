@@ -66,16 +66,17 @@ def baseline(
     progress: Callable[[str, int, int], None] | None = None,
     runs: int = 0,
     seed: int = 0,
+    lead_rows: float | None = None,
 ) -> Fitted:
     """The twin part fitted to all batches, under the covariance of what refined twins about that fit show.
 
-    All fits are to `coarse` rows, so that their cost does not depend on how often a machine is recorded. First it is
-    learned when drivers changed within a row. Refined twins are drawn twice: about a first calibration, and about the
-    fit under what those say.
+    All fits are to `coarse` rows, so that their cost does not depend on how often a machine is recorded. Refined twins
+    are drawn twice: about a first calibration, and about the fit under what those say.
 
     Args:
         runs: the number of runs, where batches are blocks of fewer.
         seed: of the refined twins.
+        lead_rows: when drivers changed within a row (`lead_of`); by default it is learned first.
 
     Raises:
         InputError: batches of another machine, twice the same, or that cannot be simulated.
@@ -83,13 +84,14 @@ def baseline(
     """
     check(machine, batches)
     tell, runs = progress or (lambda step, n, of: None), runs or len(batches)
-    network, every_s = compile_network(machine, part=part), spacing_s(batches)
     tell("baseline", 1, 3)
-    options, alike = _first_calibration(len(network.readings) + len(network.errors))
-    lead_rows, problem, state, _ = settled_with_lead(
-        machine, lambda lead: CalibrationProblem.of(network, coarse(batches, every_s, lead), every_s), options, alike
-    )
+    if lead_rows is None:
+        lead_rows = lead_of(machine, part, batches)
+    every_s, network = spacing_s(batches), compile_network(machine, part=part)
     batches = coarse(batches, every_s, lead_rows)
+    problem = CalibrationProblem.of(network, batches, every_s)
+    options, alike = _first_calibration(len(problem.channels))
+    state, _ = settled(problem, options, noise=alike)
     at = Point(machine, part, tuple(batches), problem, state.z, state.nuisance, lead_rows)
     first = POLICY.refined_twins // 2
     drawn = _structure(at, first, seed, tell)
@@ -98,6 +100,20 @@ def baseline(
     at = _fitted(_begun(at, covariance, Hyper(), runs))
     tell("baseline", 3, 3)
     return structured(at, runs, seed, tell)
+
+
+def lead_of(machine: Machine, part: TwinPart, batches: Sequence[Batch]) -> float:
+    """By how many rows a driver's change comes before the row that first shows it, as the machine file states or as is
+    likeliest with a twin part. Effects that the part lacks may make another one likelier.
+
+    Raises:
+        InputError, WorkError: as `baseline`.
+    """
+    network, every_s = compile_network(machine, part=part), spacing_s(batches)
+    options, alike = _first_calibration(len(network.readings) + len(network.errors))
+    return settled_with_lead(
+        machine, lambda lead: CalibrationProblem.of(network, coarse(batches, every_s, lead), every_s), options, alike
+    )[0]
 
 
 def structured(at: Point, runs: int, seed: int = 0, tell: Callable[[str, int, int], None] = lambda *_: None) -> Fitted:

@@ -38,8 +38,9 @@ class Figures:
         return float(1.0 / (1.0 + np.exp(-score)))
 
 
-def least_relative_gain(p: float = POLICY.claim_min_probability) -> float:
-    """From which on a claim has probability `p`; by default that from which on it is made."""
+def least_relative_gain() -> float:
+    """From which on a claim is made."""
+    p = POLICY.claim_min_probability
     return float(np.exp((np.log(p / (1.0 - p)) - POLICY.claim_offset) / POLICY.claim_weight))
 
 

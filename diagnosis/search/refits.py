@@ -35,7 +35,7 @@ def odds_of(now: Fitted, seen: Screen) -> dict[str, float]:
 def shortlist(now: Fitted, seen: Screen, odds: dict[str, float]) -> list[Scored]:
     """What is refitted: the best by gain and odds, few of a mechanism; paths of heat to bodies that show what without
     one is impossible, whatever they gain in one linear step; and labels that are plainly exchanged."""
-    least = POLICY.refit_min_gain_share * least_relative_gain(POLICY.grown_min_probability) * abs(now.log_evidence)
+    least = POLICY.refit_min_gain_share * least_relative_gain() * abs(now.log_evidence)
     ranked = sorted(
         (s for s in seen.scored if s.candidate.name in odds and s.gain > least),
         key=lambda s: (-(s.gain + odds[s.candidate.name]), s.candidate.name),

@@ -36,15 +36,15 @@ class Search:
 
 
 def search(baseline: Fitted, workers: Processes | None = None, progress: Progress | None = None) -> Search:
-    """Grown while the likeliest effect is not improbable; then each is judged, or replaced, with all others in the
-    model: two effects may each be hidden by the other."""
+    """Effects are claimed one after the other; then each is judged, or replaced, with all others in the model: two
+    effects may each be hidden by the other."""
     tell, workers = progress or (lambda step, n, of: None), workers or Processes()
     rounds: list[Round] = []
     now = baseline
     while len(rounds) < POLICY.max_effects:
         rounds.append(one_round(now, workers, tell, rounds[-1].screen if rounds else None))
         best = rounds[-1].best
-        if best is None or rounds[-1].trust < POLICY.grown_min_probability:
+        if best is None or not rounds[-1].accepted:
             break
         now = best.fitted
     first = rounds[0].before
@@ -55,27 +55,21 @@ def search(baseline: Fitted, workers: Processes | None = None, progress: Progres
 def _judged_together(
     baseline: Fitted, rounds: list[Round], workers: Processes, tell: Progress
 ) -> tuple[list[Round], Fitted]:
-    """The rounds, each with the other effects in its fit before, and the fit with those that are accepted.
-
-    What was grown after the last accepted effect neither is claimed nor has led to a claim: of that the first round
-    stays, which says what may be missing too.
-    """
-    last = max((k for k, r in enumerate(rounds) if r.accepted), default=-1)
-    rounds = rounds[: last + 2]
-    grown = [k for k, r in enumerate(rounds[: last + 1]) if r.trust >= POLICY.grown_min_probability]
-    full = rounds[grown[-1]].best.fitted if grown else baseline  # type: ignore[union-attr]
-    for k in grown[:-1]:
+    """The rounds, each with all other effects in its fit before, and the fit with those that are accepted."""
+    claimed = [k for k, r in enumerate(rounds) if r.accepted]
+    full = rounds[claimed[-1]].best.fitted if claimed else baseline  # type: ignore[union-attr]
+    for k in claimed[:-1]:
         try:
             done = one_round(less(full, rounds[k], baseline), workers, tell, rounds[k].screen)
         except (InputError, WorkError):
             continue  # no machine is without it
         if done.best is not None and done.best.fitted.log_evidence < full.log_evidence - POLICY.telling_nats:
-            continue  # the effects as they were grown explain more
+            continue  # the effects as they were claimed explain more
         rounds[k] = done
         full = done.best.fitted if done.best is not None else done.before
     if not any(r.accepted for r in rounds):
         return rounds, baseline
-    for k in grown:
+    for k in claimed:
         if not rounds[k].accepted:
             with suppress(InputError, WorkError):  # no machine is without it
                 full = less(full, rounds[k], baseline)
@@ -127,7 +121,7 @@ def decided(done: Round) -> Round:
         tried.sort(key=lambda t: (not _resolves(t, strange), not (left or t.confirmed), -t.standing))
         first, found = tried[0], figures(before, tried)
         resolved = _resolves(first, strange)
-        if not left or first.confirmed or resolved or found.probability < POLICY.grown_min_probability:
+        if not left or first.confirmed or resolved or found.probability < POLICY.claim_min_probability:
             break
         anew = anew or _redrawn(before)
         tried[0] = _confirmed(first, anew)
