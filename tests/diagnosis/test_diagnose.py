@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ import pytest
 
 from data.batch import Batch
 from data.errors import InputError
+from data.machine import Machine
 from diagnosis.contracts import COLUMNS
 from diagnosis.diagnose import diagnose
 from diagnosis.findings.schema import Findings
@@ -22,7 +23,7 @@ from tests.diagnosis.small_cases import runs, two_bodies
 from tests.diagnosis.whole import CASES, LAMP, PUMP, clamped, clamped_runs, diagnosed
 from tests.twin.recordings import empty_batches, recorded
 from twin.compile import compile_network
-from twin.schema import twin_part
+from twin.schema import TwinPart, twin_part
 
 LONGEST = pytest.param("partly_explained", marks=pytest.mark.slow)
 UNLISTED = pytest.param("unlisted", marks=pytest.mark.integration)
@@ -99,6 +100,21 @@ def test_an_effect_that_harms_left_out_runs_is_named_and_not_written(monkeypatch
     assert found.mechanism == "sensor_drift" and any("kept out of the machine file" in r for r in done.remarks)
     names = {p.name for p in compile_network(done.machine).parameters}
     assert set(done.values) and set(done.values) <= names and not done.added and not done.notes
+
+
+@pytest.mark.integration
+def test_when_drivers_act_is_learned_again_with_what_was_claimed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The twin without an effect had another time: all begins again under that which is likeliest with it."""
+    seen = []
+
+    def other(machine: Machine, part: TwinPart, batches: Sequence[Batch]) -> float:
+        seen.append(set(part.mechanisms))
+        return 0.5
+
+    monkeypatch.setattr("diagnosis.diagnose.lead_of", other)
+    done = diagnose(*CASES["explained"]())
+    assert done.search is not None and done.search.baseline.lead_rows == done.search.final.lead_rows == 0.5
+    assert seen == [{*twin_part(done.machine).mechanisms, "sensor_drift_t_head"}]
 
 
 @pytest.mark.parametrize("verdict", [UNLISTED, LONGEST])
