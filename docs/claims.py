@@ -103,37 +103,44 @@ def count(n: int) -> str:
 def kinds() -> str:
     """The diagnosis on fresh seeds of other kinds of machine."""
     rows, about = table("diagnosis_kinds")
-    effects = rows["concealed"].map(lambda text: 0 if text == "nothing" else text.count("+") + 1)
-    nothing, single, double = (rows[effects == n].replace({"visible": {"": 0}, "named": {"": 0}}) for n in (0, 1, 2))
-    visible = single[single["visible"].astype(int) > 0]
-    named = Share(int((visible["named"].astype(int) > 0).sum()), len(visible))
-    made_of = rows["claimed"].map(lambda text: len([name for name in text.split("; ") if name]))
-    true = Share(int(rows["true"].sum()), int(made_of.sum()))
+    nothing, single, double = (by_effects(rows, n) for n in (0, 1, 2))
+    named = all_named(single[single["visible"].astype(int) > 0], 1)
+    true = true_claims(rows)
     false = Share(int((nothing["claimed"] != "").sum()), len(nothing))
-    both = Share(int((double["named"].astype(int) == 2).sum()), len(double))
     return (
         f"{len(rows)} simulated cases of seeds that chose nothing, {rows['kind'].nunique()} kinds of machine, version "
         f"{about['version']}: {named} visible single effects named ({named.interval}), {true} claims true "
         f"({true.interval}), false alarms in {false} cases where nothing was missing ({false.interval}), both of two "
-        f"effects in {both} cases."
+        f"effects in {all_named(double, 2)} cases."
     )
 
 
 def withheld() -> str:
     """The diagnosis on real recordings whose machine file lacks what it is known to need."""
     rows, about = table("diagnosis_withheld")
-    concealed = rows["concealed"].map(lambda text: text.count("+") + 1)
-    single, double = rows[concealed == 1], rows[concealed == 2]
-    machines = ", ".join(sorted(set(rows["kind"])))
-    made_of = rows["claimed"].map(lambda text: len([name for name in text.split("; ") if name]))
-    true = Share(int(rows["true"].sum()), int(made_of.sum()))
-    both = Share(int((double["named"].astype(int) == 2).sum()), len(double))
+    machines, one, two = ", ".join(sorted(set(rows["kind"]))), *(all_named(by_effects(rows, n), n) for n in (1, 2))
     return (
-        f"{len(rows)} cases of real recordings ({machines}), used in the development, whose machine file "
-        f"lacks what it is known to need, version {about['version']}: what is missing is named in "
-        f"{Share(int((single['named'].astype(int) > 0).sum()), len(single))} cases of one, both in {both} of two; "
-        f"{true} claims true."
+        f"{len(rows)} cases of real recordings ({machines}), used in the development, whose machine file lacks what it "
+        f"is known to need, version {about['version']}: what is missing is named in {one} cases of one effect, both in "
+        f"{two} cases of two; {true_claims(rows)} claims true."
     )
+
+
+def by_effects(rows: pd.DataFrame, n: int) -> pd.DataFrame:
+    """The cases in which so many effects were concealed."""
+    effects = rows["concealed"].map(lambda text: 0 if text == "nothing" else text.count("+") + 1)
+    return rows[effects == n].replace({"visible": {"": 0}, "named": {"": 0}})
+
+
+def all_named(rows: pd.DataFrame, n: int) -> Share:
+    """The cases in which all `n` effects are named."""
+    return Share(int((rows["named"].astype(int) == n).sum()), len(rows))
+
+
+def true_claims(rows: pd.DataFrame) -> Share:
+    """The claims of all cases that are true."""
+    made_of = rows["claimed"].map(lambda text: len([name for name in text.split("; ") if name]))
+    return Share(int(rows["true"].sum()), int(made_of.sum()))
 
 
 def proven(page: str, cases: str) -> str:
