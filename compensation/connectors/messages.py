@@ -7,6 +7,7 @@ import math
 import re
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 from compensation.contracts import Correction, Sample
@@ -98,17 +99,19 @@ def unix_time_s(given: object, pattern: str | None = None, unit_s: float = 1.0) 
     `pattern`, if one is given, or as ISO 8601. Without an offset from UTC it is in this computer's local time.
 
     Raises:
-        ValueError: neither; the message says what was got and expected.
+        ValueError: neither, or a time of day without a date; the message says what was got and expected.
     """
     value = number(given)
     if value is not None:
         return value / 1e3 if unit_s == 1.0 and value >= _MILLISECONDS_FROM else value * unit_s
     text = given.strip() if isinstance(given, str) else ""
-    for read in (lambda: dt.datetime.strptime(text, pattern or ""), lambda: dt.datetime.fromisoformat(text)):
-        try:
-            return read().timestamp()
-        except (ValueError, OverflowError, OSError):
-            continue
+    readers = [dt.datetime.fromisoformat]
+    if pattern:
+        readers.insert(0, lambda text: dt.datetime.strptime(text, pattern))
+    for read in readers:
+        with suppress(ValueError, OverflowError, OSError):
+            if (unix_s := read(text).timestamp()) >= 0.0:
+                return unix_s
     form = f" or {pattern!r}" if pattern else ""
     raise ValueError(f"got time {excerpt(given)}, expected Unix seconds or an ISO time stamp{form}")
 

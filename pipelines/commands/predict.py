@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from data.errors import InputError, check_suffix
+from data.files import check_folder
 from data.units import error_column, in_error_unit
 
 if TYPE_CHECKING:
@@ -184,6 +185,7 @@ def predict(
     configure_environment()
     if to is not None:
         check_suffix("--out", to, (".csv", ".parquet"))
+        check_folder(to.parent, (), overwrite=True)
     table = predict_file(model, file, load())
     if to is not None and to.suffix == ".parquet":
         table.to_parquet(to, index=False)

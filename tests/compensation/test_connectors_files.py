@@ -124,6 +124,17 @@ def test_unreadable_lines_are_skipped_with_file_line_got_and_expected(
     assert "line 5" in reports[2] and "expected one JSON object" in reports[2]
 
 
+@pytest.mark.parametrize("time", ["", "  ", "1900-01-01 00:00:00"])
+def test_a_sample_without_a_time_is_skipped_and_not_of_1900(
+    time: str, machine: Machine, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = from_text(f"time_s,front\n1700000000,20\n{time},21\n1700000010,22\n", machine)
+    assert [s.time_s for s in found] == [1700000000.0, 1700000010.0]
+    assert f"line 3: got time {time.strip()!r}, expected Unix" in capsys.readouterr().err.replace(
+        repr(time), repr(time.strip())
+    )
+
+
 def test_a_long_row_of_unreadable_lines_is_reported_briefly(
     machine: Machine, capsys: pytest.CaptureFixture[str]
 ) -> None:

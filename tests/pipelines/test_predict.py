@@ -196,6 +196,16 @@ def test_rows_of_a_broken_sensor_are_not_predicted_and_the_account_names_it(stor
     assert "30 values masked: front 30 (jump_no_return)" in done.stderr
 
 
+def test_the_folder_of_a_prediction_is_made_or_refused_before_the_work(stored, tmp_path):
+    toy_batches("toy-folder", 1)[0].table.drop(columns="z").to_csv(tmp_path / "run.csv", index=False)
+    ask = ["predict", str(tmp_path / "run.csv"), "--model", str(stored), "--out"]
+    assert CliRunner().invoke(app, [*ask, str(tmp_path / "new" / "deep" / "out.csv")]).exit_code == 0
+    assert len(pd.read_csv(tmp_path / "new" / "deep" / "out.csv")) == 60
+    refused = CliRunner().invoke(app, [*ask, str(tmp_path / "run.csv" / "out.csv")])
+    assert isinstance(refused.exception, InputError)
+    assert "is a file, expected a folder; give another --out" in str(refused.exception)
+
+
 def test_a_run_that_other_models_disagree_about_is_flagged(bounded):
     batches = toy_batches("toy-bound", 4)
     double = MLR().fit([replace(b, table=b.table.assign(z=2 * b.table["z"])) for b in batches], ("front", "bed"), "z")
