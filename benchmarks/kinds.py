@@ -13,8 +13,8 @@ are done are not done again; `--workers` side by side. `--paired` takes of every
 least `--noises` times its noise, seven with none and three with two, by seeds from the number given; `--table` stores a
 row for each. `--claims` stores the likeliest claim of the first round of each instead, and prints the offset and weight
 of a claim's probability (`POLICY.claim_offset`) that are fitted to them. `--withheld` takes real recordings whose
-machine file lacks what it is known to need. The proof (`thermodrift prove --plants …`)
-asks the same under seal, with baselines.
+machine file lacks what it is known to need. The proof (`thermodrift prove --plants …`) asks the
+same under seal, with baselines.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -113,12 +113,14 @@ class Swapped(Check):
         found: dict[int, list[Finding]] = {}
         if len(batches) < _BATCHES:
             return found
-        thermal, drivers = list(batches[0].names(*THERMAL)), list(batches[0].names("driver"))
-        for names, least, prints_of in ((thermal, 3, _fingerprints), (drivers, 2, _levels)):
+        for roles, least, prints_of, least_spread in (
+            (THERMAL, 3, _fingerprints, _of_temperatures), (("driver",), 2, _levels, _of_levels),
+        ):  # fmt: skip
+            names = list(batches[0].names(*roles))
             if len(names) < least:
                 continue
             prints = np.array([prints_of(b, names) for b in batches])  # (K, p, f)
-            for k, i, j in _swaps(prints, np.array(_LEAST_SPREAD) if names is thermal else _of_range(prints)):
+            for k, i, j in _swaps(prints, least_spread):
                 message = (
                     f"{names[i]} behaves as {names[j]} does in the other batches and the other way round: their plugs "
                     "or columns have changed places"
@@ -127,12 +129,13 @@ class Swapped(Check):
         return found
 
 
-def _swaps(prints: Array, floor: Array) -> Iterator[tuple[int, int, int]]:
-    """Batch and both channels, in either order, of each swap in fingerprints (K, p, f) of spread `floor` at least."""
+def _swaps(prints: Array, least_spread: Callable[[Array], Array]) -> Iterator[tuple[int, int, int]]:
+    """Batch and both channels, in either order, of each swap in fingerprints (K, p, f), whose spread over the batches
+    counts as at least that of the median ones (p, f)."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a channel that no batch has is all NaN
         centre = np.nanmedian(prints, axis=0)
-        spread = np.maximum(1.4826 * np.nanmedian(np.abs(prints - centre), axis=0), floor)
+        spread = np.maximum(1.4826 * np.nanmedian(np.abs(prints - centre), axis=0), least_spread(centre))
     for k, own in enumerate(prints):
         # fit[i, j]: rms deviation of channel i from the fingerprint of channel j
         z = (own[:, None, :] - centre[None]) / spread[None]
@@ -149,12 +152,13 @@ def _levels(batch: Batch, names: list[str]) -> Array:
     return np.array([np.quantile(v[np.isfinite(v)], _SHARES) if np.isfinite(v).any() else [np.nan] * 3 for v in own])
 
 
-def _of_range(prints: Array) -> Array:
-    """A twentieth of the range of each channel's levels over all batches, (p, 1)."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        typical = np.nanmedian(prints, axis=0)
-    return np.asarray(0.05 * np.maximum(np.ptp(typical, axis=1), np.abs(typical).max(axis=1) * 0.1)[:, None] + 1e-12)
+def _of_levels(centre: Array) -> Array:
+    """A twentieth of the range of each channel's levels, (p, 1)."""
+    return np.asarray(0.05 * np.maximum(np.ptp(centre, axis=1), np.abs(centre).max(axis=1) * 0.1)[:, None] + 1e-12)
+
+
+def _of_temperatures(centre: Array) -> Array:
+    return np.array(_LEAST_SPREAD)
 
 
 def _fingerprints(batch: Batch, names: list[str]) -> Array:

@@ -85,14 +85,8 @@ def baseline(
     check(machine, batches)
     tell, runs = progress or (lambda step, n, of: None), runs or len(batches)
     tell("baseline", 1, 3)
-    if lead_rows is None:
-        lead_rows = lead_of(machine, part, batches)
-    every_s, network = spacing_s(batches), compile_network(machine, part=part)
-    batches = coarse(batches, every_s, lead_rows)
-    problem = CalibrationProblem.of(network, batches, every_s)
-    options, alike = _first_calibration(len(problem.channels))
-    state, _ = settled(problem, options, noise=alike)
-    at = Point(machine, part, tuple(batches), problem, state.z, state.nuisance, lead_rows)
+    at = _calibrated_first(machine, part, batches, lead_rows)
+    problem = at.problem
     first = POLICY.refined_twins // 2
     drawn = _structure(at, first, seed, tell)
     covariance = rough(problem, [POLICY.rough_structure_factor / np.sqrt(first) * d for d in drawn])
@@ -109,11 +103,26 @@ def lead_of(machine: Machine, part: TwinPart, batches: Sequence[Batch]) -> float
     Raises:
         InputError, WorkError: as `baseline`.
     """
+    return _calibrated_first(machine, part, batches).lead_rows
+
+
+def _calibrated_first(
+    machine: Machine, part: TwinPart, batches: Sequence[Batch], lead_rows: float | None = None
+) -> Point:
+    """Where a fit from the values of the machine file on ends, the lead learned unless it is given."""
     network, every_s = compile_network(machine, part=part), spacing_s(batches)
     options, alike = _first_calibration(len(network.readings) + len(network.errors))
-    return settled_with_lead(
-        machine, lambda lead: CalibrationProblem.of(network, coarse(batches, every_s, lead), every_s), options, alike
-    )[0]
+
+    def problem_at(lead: float) -> CalibrationProblem:
+        return CalibrationProblem.of(network, coarse(batches, every_s, lead), every_s)
+
+    if lead_rows is None:
+        lead_rows, problem, state, _ = settled_with_lead(machine, problem_at, options, alike)
+    else:
+        problem = problem_at(lead_rows)
+        state, _ = settled(problem, options, noise=alike)
+    own = tuple(coarse(batches, every_s, lead_rows))
+    return Point(machine, part, own, problem, state.z, state.nuisance, lead_rows)
 
 
 def structured(at: Point, runs: int, seed: int = 0, tell: Callable[[str, int, int], None] = lambda *_: None) -> Fitted:

@@ -18,6 +18,7 @@ from scipy.optimize import linear_sum_assignment
 from data.arrays import Array
 
 CROSSING, HIDDEN = 6.0, 40.0  # what a crossing and a body on a foreign link cost, in squared pitches
+HIDDEN_WITHIN = 0.45  # pitches between a link and the middle of a body that it hides
 TURNS = 72
 APART = 1.3  # of the longest way: bodies without a way between them
 SMALL = 1e-9
@@ -84,7 +85,7 @@ def _cost(xy: Array, ends: NDArray[np.int64]) -> float:
     to = xy[None] - a[:, None]
     share = np.clip((to * along[:, None]).sum(axis=-1) / np.maximum(squared, SMALL)[:, None], 0.0, 1.0)
     foreign = (np.arange(len(xy)) != ends[:, :1]) & (np.arange(len(xy)) != ends[:, 1:])
-    hidden = (np.linalg.norm(to - share[..., None] * along[:, None], axis=-1) < 0.45) & foreign
+    hidden = (np.linalg.norm(to - share[..., None] * along[:, None], axis=-1) < HIDDEN_WITHIN) & foreign
     return float(squared.sum() + HIDDEN * hidden.sum() + CROSSING * crossings(xy, ends))
 
 
