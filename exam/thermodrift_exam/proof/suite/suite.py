@@ -19,8 +19,8 @@ from thermodrift_exam.proof.suite.setting import setting
 from thermodrift_exam.proof.suite.sizes import size
 
 MIX: Mapping[Kind, float] = MappingProxyType({
-    "nothing": 0.15, "decoy": 0.15, "one": 0.35, "two": 0.12, "three": 0.05, "confounded": 0.07, "unlisted": 0.07,
-    "invisible": 0.04,
+    "nothing": 0.16, "decoy": 0.155, "one": 0.375, "two": 0.125, "three": 0.02, "confounded": 0.03, "unlisted": 0.125,
+    "invisible": 0.01,
 })  # fmt: skip
 LACKING: tuple[Kind, ...] = ("one", "two", "three", "confounded", "unlisted", "invisible")  # physics is left out
 
