@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 import math
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from data.errors import InputError, one_of
+from data.errors import InputError, WorkError, one_of
 from data.files import write_atomic
 from data.units import error_column, in_error_unit, unit_label
 from pipelines import console
@@ -235,3 +236,8 @@ def train(
         console.print_json(training_dict(outcome))
     else:
         print_training(outcome)
+    if not outcome.postponed:
+        from pipelines.fleet import watching
+
+        with suppress(InputError, WorkError):  # while MLflow is loaded; else the next `status` gathers it
+            watching.refresh(configured)

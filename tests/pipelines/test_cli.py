@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 
 from pipelines import cli
+from pipelines.fleet import watching
 from pipelines.commands.ingest import print_findings
 from tests.toys.command import Call
 from tests.toys.small_year import law_um, write_machine, write_year
@@ -58,6 +59,7 @@ def test_training_shows_what_came_of_it(year: Path, call: Call) -> None:
     assert f"{NAME} z  (simulated recordings), S mean ± std, µm" in details and "nothing new registered" in details
     assert all(word in details for word in ("ridge", "zero", "batch out"))
     assert (year / "r.md").exists()
+    assert watching.warm() is not None, "`status` after it needs no MLflow"
     assert lines(done.err)[0] == "features and selectors of 6 batches"
 
 
