@@ -1,5 +1,5 @@
 """Baselines and ablations: standard methods, and the diagnosis with one rule removed, on the same fits."""
 
-from thermodrift_rivals.evaluate import replies
+from thermodrift_rivals.evaluate import baselines, replies
 
-__all__ = ["replies"]
+__all__ = ["baselines", "replies"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from data.processes import Processes
-from diagnosis.contracts import Candidate, Fitted, Scored, Where
+from diagnosis.contracts import Candidate, Fitted, Where
 from diagnosis.findings.conclude import claimed, rms_of, slow_residual_ratio, verdict_of
 from diagnosis.findings.report_data import Found, rms_table
 from diagnosis.findings.schema import Findings, Verdict
@@ -13,11 +13,8 @@ from diagnosis.fitting.covariance import independent, white_noise
 from diagnosis.fitting.fitted import left_out_rows, under
 from diagnosis.policy import POLICY, Policy
 from diagnosis.search.claims import Round, explanations
-from diagnosis.search.refits import odds_of, refits
-from diagnosis.search.search import Search, decided, one_round
-from thermodrift_rivals.base import Claim, Reply, claimable, correlations
-
-REFITS = 4  # of a screen without projection, each of another mechanism
+from diagnosis.search.search import Search, one_round
+from thermodrift_rivals.base import Claim, Reply
 
 
 @dataclass(frozen=True)
@@ -56,19 +53,6 @@ def reference(stage: Stage) -> Reply:
     if stage.findings is not None and stage.findings.verdict == "unlisted":
         return Reply("unlisted", _unlisted(stage.findings))
     return stage.reply(stage.round)
-
-
-def no_projection(stage: Stage) -> Reply:
-    """Screened without projection of recalibrated parameters; the best mechanisms are refitted, full rules judge."""
-    r = stage.round
-    strength = correlations(r)
-    ranked = sorted(claimable(r), key=lambda s: (-strength[s.column], s.candidate.name))
-    first: dict[str, Scored] = {}
-    for s in ranked:
-        first.setdefault(s.candidate.mechanism, s)
-    work, odds = list(first.values())[:REFITS], odds_of(r.before, r.screen)
-    tried = refits(r.before, r.screen, work, odds, Processes(), lambda step, n, of: None)
-    return stage.reply(decided(replace(r, tried=tuple(tried))))
 
 
 def independent_noise(stage: Stage) -> Reply:

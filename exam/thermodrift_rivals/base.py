@@ -105,13 +105,6 @@ def bounds(scored: Sequence[Scored]) -> tuple[Array, Array]:
     return low, np.full(len(scored), np.inf)
 
 
-def correlations(done: Round) -> Array:
-    """|cos| (C,) of every signature with the residual, in units of the given noise, nothing projected out."""
-    residual = np.concatenate(done.before.problem.residuals(done.before.x, done.before.own))
-    columns = np.concatenate(done.screen.signatures.columns)
-    return np.asarray(np.abs(residual @ columns) / np.maximum(np.linalg.norm(columns, axis=0), TINY))
-
-
 def claimable(done: Round) -> list[Scored]:
     """Candidates with a signature, but those that any lumped network has some of."""
     own = odds_of(done.before, done.screen)

@@ -25,11 +25,21 @@ ABLATIONS = Registry(
     "ablation",
     {
         "reference": "thermodrift_rivals.ablations:reference",
-        "no_projection": "thermodrift_rivals.ablations:no_projection",
         "independent_noise": "thermodrift_rivals.ablations:independent_noise",
         "no_floor_check": "thermodrift_rivals.ablations:no_floor_check",
     },
 )
+
+
+@threadpool_limits.wrap(limits=1)
+def baselines(done: Diagnosis | Search) -> dict[str, Any]:
+    """The replies of the baselines alone, which take a second; ablations refit and take as long as a diagnosis.
+
+    Raises:
+        WorkError: a diagnosis that kept no search.
+    """
+    search = _search_of(done)
+    return {"baselines": {key: _timed(BASELINES[key], search) for key in BASELINES}}
 
 
 @threadpool_limits.wrap(limits=1)
@@ -42,15 +52,19 @@ def replies(done: Diagnosis | Search) -> dict[str, Any]:
     Raises:
         WorkError: a diagnosis that kept no search.
     """
-    search = done.search if isinstance(done, Diagnosis) else done
-    if search is None or not search.rounds:
-        raise WorkError("baselines: the diagnosis kept no search; hand over one that `diagnose` has just made")
-    stage = Stage(search, done.findings if isinstance(done, Diagnosis) else None)
+    stage = Stage(_search_of(done), done.findings if isinstance(done, Diagnosis) else None)
     return {
-        "baselines": {key: _timed(BASELINES[key], search) for key in BASELINES},
+        **baselines(done),
         "ablations": {key: _timed(ABLATIONS[key], stage) for key in ABLATIONS if key != "reference"},
         "reference": _timed(ABLATIONS["reference"], stage),
     }
+
+
+def _search_of(done: Diagnosis | Search) -> Search:
+    search = done.search if isinstance(done, Diagnosis) else done
+    if search is None or not search.rounds:
+        raise WorkError("baselines: the diagnosis kept no search; hand over one that `diagnose` has just made")
+    return search
 
 
 def _timed(method: Any, given: Any) -> dict[str, Any]:

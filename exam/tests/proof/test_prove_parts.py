@@ -11,7 +11,7 @@ import pytest
 from data.errors import InputError
 from thermodrift_exam.proof import judging as proof_again
 from thermodrift_exam.proof.judging import plain_json, truth_from_json
-from thermodrift_exam.proof.proving import ProofRequest, drawn, specs_of
+from thermodrift_exam.proof.proving import ProofRequest, drawn, examinee, specs_of
 from thermodrift_exam.proof.scoring.true_model import TrueModel
 from thermodrift_exam.proof.sealing.folder import Ledger
 from thermodrift_exam.proof.sealing.running import Examinee
@@ -47,6 +47,12 @@ def test_a_true_model_is_kept_as_it_is() -> None:
     back = truth_from_json(plain_json(vars(truth)))
     assert back is not None and repr(back) == repr(truth)
     assert truth_from_json(None) is None
+
+
+def test_ablations_run_on_the_first_cases_alone() -> None:
+    by = examinee(ablated=2)
+    assert [by.of(k).baselines for k in range(4)] == ["thermodrift_rivals:replies"] * 2 + [by.cheap] * 2
+    assert {examinee().of(k).baselines for k in (0, 500)} == {"thermodrift_rivals:replies"}
 
 
 def test_the_proposed_run_is_one_more_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,8 +14,8 @@ from diagnosis.candidates.priors import free_values
 from diagnosis.screening.signatures import difference
 from diagnosis.search.search import Search, search
 from tests.diagnosis.small_cases import cold_floor, consistent
-from thermodrift_rivals import replies
-from thermodrift_rivals.base import correlations, plain_rows
+from thermodrift_rivals import baselines, replies
+from thermodrift_rivals.base import plain_rows
 from thermodrift_rivals.evaluate import ABLATIONS, BASELINES
 from twin.mechanisms import MECHANISMS
 
@@ -51,6 +51,7 @@ def test_a_reply_has_the_agreed_form() -> None:
         assert reply["verdict"] in ("consistent", "explained", "partly_explained", "unlisted", "undecidable")
         assert all(f["where"].keys() == {"kind", "name"} for f in reply["findings"])
     assert json.loads(json.dumps(out, allow_nan=False)) == out
+    assert set(baselines(floor())) == {"baselines"}
 
 
 @pytest.mark.parametrize("key", ["sparse_regression", "in_sample_bic"])
@@ -95,4 +96,3 @@ def test_signatures_are_what_a_little_of_the_mechanism_changes() -> None:
         change[own] = (change[own] - change[own].mean()) / np.sqrt(np.mean(residual[own] ** 2))
     assert MECHANISMS["cabinet_heat"].off == {"heat": 0.0}
     assert np.corrcoef(change, rows.columns[:, k])[0, 1] > 0.999
-    assert correlations(done)[s.column] > 0

@@ -57,6 +57,15 @@ def test_every_method_is_counted_on_the_same_cases() -> None:
     assert at["lead"].notna().sum() == 3
 
 
+def test_an_ablation_counts_where_it_ran() -> None:
+    keys, given, true = proof()
+    for name in list(given)[2:]:
+        given[name] = replace(given[name], replies={"baselines": given[name].replies["baselines"]})
+    at = compared(keys, given, true).set_index(["method", "measure"])
+    assert at.loc[("in_sample", RIGHT), ["value", "n", "lead"]].tolist() == [1 / 2, 2, 1 / 2]
+    assert at.loc[("reference", RIGHT), "n"] == 2 and at.loc[("raw_correlation", RIGHT), "n"] == 8
+
+
 def test_the_goal_is_the_lead_over_the_best_baseline() -> None:
     keys, given, true = proof()
     goals = goal_table(*outcomes(keys, given, true), compared(keys, given, true))

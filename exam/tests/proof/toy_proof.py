@@ -153,7 +153,7 @@ def _goals(draws: np.random.Generator, plants: Sequence[str]) -> pd.DataFrame:
 def _compared(draws: np.random.Generator) -> pd.DataFrame:
     methods = {
         "diagnosis": ("diagnosis",), "baseline": ("raw_correlation", "sparse_regression", "in_sample_bic"),
-        "ablation": ("reference", "no_projection", "independent_noise", "in_sample", "no_structural_null",
+        "ablation": ("reference", "independent_noise", "in_sample", "no_structural_null",
                      "no_floor_check"),
     }  # fmt: skip
     measures = {

@@ -88,6 +88,7 @@ Which = Annotated[str, typer.Option("--suite", help="sealed: from a secret; deve
 Data = Annotated[Path | None, typer.Option("--data", help="folder of real recordings, for grafted and withheld")]
 Seed = Annotated[int | None, typer.Option(help="of a development suite; default: drawn, and printed")]
 Limit = Annotated[float, typer.Option(help="seconds that a diagnosis may take")]
+Ablated = Annotated[int | None, typer.Option(help="ablations for the first N cases alone; default: for all")]
 Deals = Annotated[int, typer.Option(help="permutations of the leak test; 0: no leak test")]
 Proof = Annotated[Path, typer.Argument(metavar="PROOF", help="folder of the proof")]
 BOTH = "elements,volumes"
@@ -104,6 +105,7 @@ def prove(
     data: Data = None,
     workers: Workers = None,
     limit: Limit = 300.0,
+    ablated: Ablated = None,
     deals: Deals = 100,
     as_json: Json = False,
 ) -> None:
@@ -116,7 +118,7 @@ def prove(
 
     request = _request(cases, to, plants, suite, seed, data)
     with console.progress(as_json) as (say, done):
-        outcome = prove_all(request, processes(workers), _examinee(limit), _deals(deals), say, done)
+        outcome = prove_all(request, processes(workers), _examinee(limit, ablated), _deals(deals), say, done)
     if as_json:
         console.print_json(proof_dict(outcome))
     else:
@@ -153,6 +155,7 @@ def run(
     proof: Proof,
     workers: Workers = None,
     limit: Limit = 300.0,
+    ablated: Ablated = None,
     restart: Annotated[
         bool, typer.Option("--restart", help="drop the answers of another source version; the ledger records it")
     ] = False,
@@ -162,7 +165,7 @@ def run(
     from thermodrift_exam.proof.proving import run_proof
 
     with console.progress(as_json) as (_, done):
-        outcome = run_proof(proof, processes(workers), restart, _examinee(limit), done)
+        outcome = run_proof(proof, processes(workers), restart, _examinee(limit, ablated), done)
     if as_json:
         console.print_json(asdict(outcome))
         return
@@ -212,12 +215,14 @@ def _request(cases: int, to: Path | None, plants: str, suite: str, seed: int | N
     return ProofRequest(to, cases, which, check_plants(split(plants)), seed, data)
 
 
-def _examinee(limit_s: float) -> Examinee:
+def _examinee(limit_s: float, ablated: int | None) -> Examinee:
     from thermodrift_exam.proof.proving import examinee
 
     if not limit_s > 0:
         raise InputError(f"--limit: got {limit_s:g}, expected more than 0 seconds")
-    return examinee(limit_s)
+    if ablated is not None and ablated < 0:
+        raise InputError(f"--ablated: got {ablated}, expected 0 or more")
+    return examinee(limit_s, ablated)
 
 
 def _deals(deals: int) -> int:

@@ -113,9 +113,10 @@ def seal_proof(request: ProofRequest, workers: int, done: Done | None = None) ->
 RIVALS = Path(__file__).resolve().parents[2] / "thermodrift_rivals"  # next to this package, which stays unseen
 
 
-def examinee(limit_s: float = LIMIT_S) -> Examinee:
-    """The diagnosis, and the baselines and ablations on its fits."""
-    return Examinee(baselines="thermodrift_rivals:replies", limit_s=limit_s, import_from=(str(RIVALS),))
+def examinee(limit_s: float = LIMIT_S, ablated: int | None = None) -> Examinee:
+    """The diagnosis, and the baselines on its fits; ablations for the first `ablated` cases, None: for all."""
+    both, one = "thermodrift_rivals:replies", "thermodrift_rivals:baselines"
+    return Examinee(baselines=both, cheap=one, compared=ablated, limit_s=limit_s, import_from=(str(RIVALS),))
 
 
 def run_proof(

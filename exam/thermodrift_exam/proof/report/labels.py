@@ -28,7 +28,7 @@ KIND_WORDS = {
 _METHODS = {
     "diagnosis": "the diagnosis", "raw_correlation": "largest raw correlation",
     "sparse_regression": "sparse regression on the residual", "in_sample_bic": "forward selection, in-sample BIC",
-    "reference": "first round, full rules", "no_projection": "without projection",
+    "reference": "first round, full rules",
     "independent_noise": "rows as independent noise",
     "no_floor_check": "without the floor check",
 }  # fmt: skip

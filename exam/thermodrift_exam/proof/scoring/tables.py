@@ -133,6 +133,8 @@ def compared(
 ) -> pd.DataFrame:
     """One row a method and measure, over the cases that have replies of baselines; shares with exact 90 % intervals.
 
+    Ablations, and the reference, count the cases that have any ablation.
+
     `group` is diagnosis, baseline or ablation. `lead`, of right answers only, is paired by case with a bootstrap
     interval: of the diagnosis over a baseline, of the full rules in the first round (reference) over an ablation.
 
@@ -141,16 +143,18 @@ def compared(
     """
     known = {name: own for name, own in stored.items() if own.replies is not None and name in answers}
     keys = {name: answers[name] for name in known}
+    ablated = {name: own for name, own in known.items() if (own.replies or {}).get("ablations")}
     replies: dict[str, str] = {"diagnosis": "diagnosis"}
     for own in known.values():
         given = own.replies or {}
         replies |= {"reference": "ablation"} if "reference" in given else {}
         replies |= dict.fromkeys(given.get("baselines", {}), "baseline")
         replies |= dict.fromkeys(given.get("ablations", {}), "ablation")
-    tables = {
-        method: _scored(keys, known if method == "diagnosis" else _answered(known, method), truths)
-        for method in replies
-    }
+    tables = {}
+    for method, group in replies.items():
+        among = ablated if group == "ablation" else known
+        answered = among if method == "diagnosis" else _answered(among, method)
+        tables[method] = _scored({name: keys[name] for name in among}, answered, truths)
     against = {"baseline": tables["diagnosis"], "ablation": tables.get("reference", tables["diagnosis"])}
     rows: list[dict[str, Any]] = []
     for method, group in replies.items():
@@ -159,7 +163,8 @@ def compared(
             value = float(values.mean()) if len(values) else float("nan")
             row = {"method": method, "group": group, "measure": measure, "value": value, "low90": low, "high90": high}
             led = measure == RIGHT and group != "diagnosis" and method != "reference" and len(values)
-            rows.append({**row, "n": len(values), **(_lead(against[group], tables[method]) if led else {})})
+            lead = _lead(against[group].loc[tables[method].index], tables[method]) if led else {}
+            rows.append({**row, "n": len(values), **lead})
     return pd.DataFrame(rows, columns=list(COMPARED_COLUMNS))
 
 

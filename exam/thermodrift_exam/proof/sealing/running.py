@@ -11,7 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from threading import Event
@@ -45,15 +45,23 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXP
 class Examinee:
     """Who answers: functions as ``module:function``, called as `diagnose` is and as ``replies(diagnosis)``.
 
-    The replies of `baselines` are plain data, or a text of such. `limit_s` is the longest that a diagnosis may take,
+    The replies of `baselines` are plain data, or a text of such; after the first `compared` cases of the suite, whose
+    order is random, `cheap` answers instead. `limit_s` is the longest that a diagnosis may take,
     and again the longest that the baselines may. `import_from` are packages, or folders of modules, other than the
     product's that may be read.
     """
 
     diagnose: str = "diagnosis.diagnose:diagnose"
     baselines: str | None = None
+    cheap: str | None = None
+    compared: int | None = None
     limit_s: float = LIMIT_S
     import_from: tuple[str, ...] = ()
+
+    def of(self, index: int) -> Examinee:
+        """Who answers the case at a place of the suite."""
+        past = self.compared is not None and index >= self.compared
+        return replace(self, baselines=self.cheap) if past else self
 
 
 def examine(
@@ -210,7 +218,7 @@ def run(
         def answer(case: str, stop: Event) -> dict[str, bytes]:
             check_case(folder, case, commitment["cases"][case]["case"])
             ledger.add("started", case=case)
-            files = examine(folder.cases / case, by, source, stop)
+            files = examine(folder.cases / case, by.of(names.index(case)), source, stop)
             _check_source(folder, source)
             return files
 
