@@ -20,8 +20,8 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.optimize import nnls
+from scipy.special import stdtrit
 
 from data.arrays import Array
 from data.checks.base import THERMAL
@@ -354,7 +354,7 @@ class _Pooling:
         weights = (S_mean_um.min() / S_mean_um) ** _SHARPNESS
         weights /= weights.sum()
         coef_um = weights @ np.array([process.gains(self._place(without)) for process in processes])
-        widened = (stats.t.ppf(0.95, len(voters) - 1) / SIDE_OF_90) ** 2
+        widened = (stdtrit(len(voters) - 1, 0.95) / SIDE_OF_90) ** 2
         spread_um2 = widened * self._spread_um2(np.tensordot(weights, left_um, 1), rest)
         return {"coef_um": coef_um, "spread_um2": spread_um2, "mistrusted": mistrusted, "setting_weights": weights}
 
