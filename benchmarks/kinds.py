@@ -25,6 +25,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
 from threadpoolctl import threadpool_limits
 
 from benchmarks.results import write
+from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
@@ -47,6 +49,7 @@ from diagnosis.result import Diagnosis
 from diagnosis.search.claims import Round, alike
 from diagnosis.search.search import one_round
 from thermodrift_exam.plants.plant import Case
+from thermodrift_exam.plants.real import recorded
 from thermodrift_exam.plants.withheld import CASES, build, cases
 from thermodrift_exam.proof.scoring.answer_key import AnswerKey, Spot
 from thermodrift_exam.proof.scoring.matching import names_term
@@ -87,12 +90,16 @@ def of_withheld(name: str, data: str, out: str) -> dict[str, Any]:
         return dict(json.loads(path.read_text()))
     case, about = build(name, Path(data), seed=1), CASES[name]
     row = {"kind": about.machine, "seed": name, "what": about.kind, "terms": case.answer["terms"]}
-    return _diagnosed(path, row, case.machine, case.batches, case.answer)
+    hidden = {}
+    for channel in about.channels:
+        _, full = recorded(about.machine, Path(data), seed=1)
+        hidden = {b.batch_id: (b.time_s, b.values(channel)) for b in full}
+    return _diagnosed(path, row, case.machine, case.batches, case.answer, hidden=hidden)
 
 
 def _diagnosed(
     path: Path, row: dict[str, Any], machine: Machine, given: Sequence[Batch], answer: Mapping[str, Any],
-    proposed: int = 0,
+    proposed: int = 0, hidden: Mapping[str, tuple[Array, Array]] = MappingProxyType({}),
 ) -> dict[str, Any]:  # fmt: skip
     """The row with the diagnosis of a case and its judgement, kept in a file."""
     key, begun = AnswerKey.from_json(answer), time.process_time()
@@ -103,6 +110,7 @@ def _diagnosed(
                 batches, _ = usable_batches(compile_network(machine, part=part), batches)
             done = diagnose(machine, batches)
             row |= _answered(done, key, part or done.part_before)
+            row |= _left_out(done) | (_recovered(done, hidden) if hidden else {})
             row["cpu_s"] = round(time.process_time() - begun, 1)
             row["proposed"] = list(_proposed(done, machine, batches, answer["redraw"], key, proposed))
             if row["what"] in ("one", "two"):
@@ -181,6 +189,29 @@ def _proposed(
         batches.append(replace(run.batch, batch_id=f"proposed_{k}"))
         done = diagnose(machine, batches)
         yield about | _answered(done, key, twin_part(machine))
+
+
+def _left_out(done: Diagnosis) -> dict[str, Any]:
+    """What is left of the error in runs left out once the findings are modelled, a share; channels count alike."""
+    rms = done.tables["rms"]
+    squared = (
+        rms.assign(before=rms["before"] ** 2, after=rms["after"] ** 2).groupby("channel")[["before", "after"]].mean()
+    )
+    return {"left_share": float(np.sqrt(squared["after"] / squared["before"]).mean())}
+
+
+def _recovered(done: Diagnosis, hidden: Mapping[str, tuple[Array, Array]]) -> dict[str, Any]:
+    """Where the free series of heat stands out most from its standard deviation, and its correlation with the hidden
+    input over all runs, whose times (s) and values these are by run."""
+    flux = done.tables["flux"].dropna(subset=["value", "sd"])
+    flux = flux[flux["kind"] == "node"]
+    if flux.empty:
+        return {}
+    strength = ((flux["value"] / flux["sd"]) ** 2).groupby(flux["place"]).mean()
+    own = flux[flux["place"] == strength.idxmax()]
+    given = np.concatenate([np.interp(g["time_s"], *hidden[str(b)]) for b, g in own.groupby("batch", sort=False)])
+    value = np.concatenate([g["value"].to_numpy() for _, g in own.groupby("batch", sort=False)])
+    return {"place": str(strength.idxmax()), "r": float(np.corrcoef(given, value)[0, 1])}
 
 
 def _visible(truth: TrueModel) -> dict[str, Any]:
@@ -283,6 +314,8 @@ def as_rows(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
             "claimed": "; ".join(f["name"] for f in r.get("listed", ())),
             "true": sum(bool(f["of"]) for f in r.get("listed", ())),
             "named": _named(r) if effects and "verdict" in r else "", "cpu_s": round(r.get("cpu_s", 0.0)),
+            **({"left_share": round(r["left_share"], 3)} if "left_share" in r else {}),
+            **({"stands_out": r["place"], "r_hidden": round(r["r"], 2)} if "place" in r else {}),
         })  # fmt: skip
     return pd.DataFrame(found).sort_values(["kind", "seed", "concealed"])
 

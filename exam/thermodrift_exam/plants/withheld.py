@@ -2,14 +2,14 @@
 
 Each case removes or replaces parts of a machine file, and states the terms that a diagnosis should find. Sizes of board
 and cell are those that the full file calibrates; those of the lathe are the values of its file, which is fitted to its
-runs. Of the spindle test the speed is withheld, the only cause of its heat; it has no twin part, so that the network is
-drafted.
+runs. Inputs are withheld one at a time: each driver and the room of lathe and spindle test, each heater of the board.
+The spindle test has no twin part, so that its network is drafted.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -25,7 +25,8 @@ TermOf = Callable[[Mapping[str, Any], list[Batch]], Term]  # from the full file'
 
 @dataclass(frozen=True)
 class Withheld:
-    """One case. `without` and `instead` are dotted paths below the machine file's `twin`; `channels` are hidden.
+    """One case. `without` and `instead` are dotted paths below the machine file's `twin`; `channels` are hidden, and
+    with them the mechanisms that they drive.
 
     `terms` state the answer. `twin` False: the file has no twin part at all.
     """
@@ -43,6 +44,8 @@ class Withheld:
     def hidden_from(self, machine: Machine, batches: list[Batch]) -> tuple[Machine, list[Batch]]:
         """Machine file and runs without the withheld part."""
         part = copy.deepcopy(machine.twin) if self.twin else None
+        for path in () if part is None else _driven(part["mechanisms"], self.channels):
+            del part["mechanisms"][path]
         for path in self.without:
             *keys, last = path.split(".")
             for at in parts_at(part, keys):
@@ -58,6 +61,20 @@ class Withheld:
     def _hidden(self, batch: Batch) -> Batch:
         kept = {n: c for n, c in batch.channels.items() if n not in self.channels}
         return replace(batch, channels=kept, table=batch.table.drop(columns=list(self.channels)))
+
+
+def _driven(mechanisms: Mapping[str, Any], channels: Collection[str]) -> list[str]:
+    """Mechanisms that a channel drives, and those that act on these alone."""
+    out = [name for name, m in mechanisms.items() if set(_several(m.get("drivers", ()))) & set(channels)]
+    for name, m in mechanisms.items():
+        others = _several(m.get("acts_on", ()))
+        if name not in out and others and set(others) <= set(out):
+            out.append(name)
+    return out
+
+
+def _several(given: Any) -> list[str]:
+    return [given] if isinstance(given, str) else list(given.values() if isinstance(given, Mapping) else given)
 
 
 # The laboratory board: its heaters share one supply and one circuit board.
@@ -179,14 +196,23 @@ def _of_lathe(
     return term
 
 
-def _hidden_speed(twin: Mapping[str, Any], batches: list[Batch]) -> Term:
-    """Heat by a driver that no channel shows; sensor positions are not documented, so any body is the place."""
-    turning = [b.values("spindle_rpm") > 0 for b in batches]
-    bodies = batches[0].names("temperature")
-    return Term(
-        "unlisted_speed", None, ("node", bodies[0]), also=[("node", b) for b in bodies[1:]],
-        active=windows(batches, turning), words="heat that follows a speed which was not recorded",
-    )  # fmt: skip
+def _hidden(channel: str, *bodies: str) -> TermOf:
+    """The heat of an input that no channel shows, at any of these bodies; without bodies, or where their places are not
+    documented, at any that has a sensor."""
+
+    def term(twin: Mapping[str, Any], batches: list[Batch]) -> Term:
+        first, *others = bodies or tuple(twin.get("bodies", ())) or batches[0].names("temperature")
+        driver = batches[0].channels[channel].role == "driver"
+        active = windows(batches, [b.values(channel) > 0 for b in batches]) if driver else "always"
+        return Term(
+            f"unlisted_{channel}", None, ("node", first), also=[("node", b) for b in others], active=active,
+            words=f"heat that follows {channel}, which was not recorded",
+        )  # fmt: skip
+
+    return term
+
+
+UNLOGGED = {"per_batch": "0.5 K"}  # a room as a file states it that has no channel for it
 
 
 _CASES = (
@@ -219,8 +245,23 @@ _CASES = (
              ("mechanisms.grease",)),
     Withheld("lathe_z_shift", "lathe_gv1203", "shift of Z by the speed withheld",
              (_of_lathe("z_shift", ("error", "disp_z"), "shift"),), ("mechanisms.z_shift",)),
-    Withheld("spindle_speed", "spindle_fl", "the spindle's speed withheld", (_hidden_speed,),
+    Withheld("board_input1", "tclab_board", "the first heater's level withheld", (_hidden("heater1", "heater1"),),
+             channels=("heater1",), kind="unlisted"),
+    Withheld("board_input2", "tclab_board", "the second heater's level withheld", (_hidden("heater2", "heater2"),),
+             channels=("heater2",), kind="unlisted"),
+    Withheld("lathe_speed", "lathe_gv1203", "the spindle's speed withheld",
+             (_hidden("spindle_rpm", "nose", "head", "motor", "motor_cover"),), channels=("spindle_rpm",),
+             kind="unlisted"),
+    Withheld("lathe_feed", "lathe_gv1203", "the feed withheld",
+             (_hidden("feed_mm_min", "nut", "nut_house", "cast", "x_drive", "z_drive", "slide", "saddle", "cover_a"),),
+             channels=("feed_mm_min",), kind="unlisted"),
+    Withheld("lathe_room", "lathe_gv1203", "the room's temperature withheld", (_hidden("TC08"),),
+             instead={"surroundings.room": UNLOGGED | {"first": ["PT01", "TC01"]}}, channels=("TC08",),
+             kind="unlisted"),
+    Withheld("spindle_speed", "spindle_fl", "the spindle's speed withheld", (_hidden("spindle_rpm"),),
              channels=("spindle_rpm",), twin=False, kind="unlisted"),
+    Withheld("spindle_room", "spindle_fl", "the room's temperature withheld", (_hidden("t16"),),
+             channels=("t16",), twin=False, kind="unlisted"),
 )  # fmt: skip
 CASES: Mapping[str, Withheld] = MappingProxyType({c.name: c for c in _CASES})
 
