@@ -15,8 +15,8 @@ import pandas as pd
 import pytest
 
 from pipelines import cli
-from pipelines.fleet import watching
 from pipelines.commands.ingest import print_findings
+from pipelines.fleet import watching
 from tests.toys.command import Call
 from tests.toys.small_year import law_um, write_machine, write_year
 

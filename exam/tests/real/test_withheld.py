@@ -24,7 +24,7 @@ from twin.compile import compile_network
 from twin.schema import twin_part
 
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="no ../shared/data")
-WITH_TWIN = [n for n, c in CASES.items() if c.twin]
+LISTED = [n for n, c in CASES.items() if c.kind != "unlisted"]
 
 
 def machine_text(machine: Machine) -> str:
@@ -38,7 +38,7 @@ def test_there_are_cases_of_all_four_machines_and_none_without_recordings(tmp_pa
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow if n == "lathe_nut" else []) for n in WITH_TWIN]
+    "name", [pytest.param(n, marks=pytest.mark.slow if n == "lathe_nut" else []) for n in LISTED]
 )
 def test_what_is_kept_back_can_be_proposed_for_the_file_that_lacks_it(name: str) -> None:
     case = build(name, DATA, 1)
@@ -67,11 +67,15 @@ def test_the_case_reads_back_from_its_files_as_it_was(name: str, tmp_path: Path)
             assert back.values(channel) == pytest.approx(batch.values(channel), rel=1e-8, nan_ok=True), channel
 
 
-def test_the_hidden_speed_is_nowhere_in_what_is_seen() -> None:
-    case = build("spindle_speed", DATA, 3)
-    assert case.machine.twin is None
-    assert "rpm" not in machine_text(case.machine)
-    assert not any("spindle_rpm" in b.table.columns or "spindle_rpm" in b.channels for b in case.batches)
+@pytest.mark.parametrize("name", [n for n, c in CASES.items() if c.channels])
+def test_a_hidden_input_is_nowhere_in_what_is_seen(name: str) -> None:
+    case = build(name, DATA, 3)
+    for channel in CASES[name].channels:
+        drivers = [m.get("drivers") for m in (case.machine.twin or {}).get("mechanisms", {}).values()]
+        assert channel not in case.machine.channels and channel not in str(drivers)
+        assert not any(channel in b.table.columns or channel in b.channels for b in case.batches)
+    if case.machine.twin is not None:
+        compile_network(case.machine)
 
 
 def test_the_seed_picks_runs_and_hours_and_the_same_seed_the_same_ones() -> None:

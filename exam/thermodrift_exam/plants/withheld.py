@@ -44,8 +44,9 @@ class Withheld:
     def hidden_from(self, machine: Machine, batches: list[Batch]) -> tuple[Machine, list[Batch]]:
         """Machine file and runs without the withheld part."""
         part = copy.deepcopy(machine.twin) if self.twin else None
-        for path in () if part is None else _driven(part["mechanisms"], self.channels):
-            del part["mechanisms"][path]
+        mechanisms = part["mechanisms"] if part is not None else {}
+        for name in _driven(mechanisms, self.channels):
+            del mechanisms[name]
         for path in self.without:
             *keys, last = path.split(".")
             for at in parts_at(part, keys):
