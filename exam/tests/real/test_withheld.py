@@ -37,9 +37,7 @@ def test_there_are_cases_of_all_four_machines_and_none_without_recordings(tmp_pa
     assert cases(tmp_path) == []
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow if n == "lathe_nut" else []) for n in LISTED]
-)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n == "lathe_nut" else []) for n in LISTED])
 def test_what_is_kept_back_can_be_proposed_for_the_file_that_lacks_it(name: str) -> None:
     case = build(name, DATA, 1)
     compile_network(case.machine)
