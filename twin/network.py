@@ -27,8 +27,8 @@ class Port:
 class Law:
     """A mechanism at work: parameter numbers by name, driver channels and ports by the law's own names for them.
 
-    One `asleep` stands at values without effect: it costs a simulation nothing, and derivatives by its parameters are
-    what it would do. A diagnosis thus screens all candidates in one pass.
+    A `disabled` law has its null values, at which it has no effect: it costs a simulation nothing, and the derivatives
+    by its parameters are its first-order response. A diagnosis thus screens all candidates in one pass.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Law:
     parameters: Mapping[str, int]
     drivers: Mapping[str, str]
     ports: Mapping[str, Port]
-    asleep: bool = False
+    disabled: bool = False
 
     @property
     def temperature_dependent(self) -> bool:
@@ -67,9 +67,9 @@ class Heat:
     bent: tuple[float, float] = (1.0, 1.0)
 
     @property
-    def asleep(self) -> bool:
+    def disabled(self) -> bool:
         """Whether its watts do not count: some law of it is a candidate's."""
-        return self.law.asleep or any(f.asleep for f in self.factors)
+        return self.law.disabled or any(f.disabled for f in self.factors)
 
     @property
     def temperature_dependent(self) -> bool:

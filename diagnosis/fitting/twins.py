@@ -104,7 +104,7 @@ def _misfit(
         sd_K = max(POLICY.start_gradient_min_sd_K, POLICY.start_gradient_share * network.start_spread_K)
         across_K = dice.of("start", body).normal(0.0, sd_K, (n, 1))
         fine.start_degC[:, cells] += across_K * np.linspace(-1.0, 1.0, len(cells))
-    laws = [h.law.name for h in network.heats if not h.asleep]
+    laws = [h.law.name for h in network.heats if not h.disabled]
     scatter = {name: np.exp(dice.of("run", name).normal(0.0, POLICY.run_to_run_log_sd, n)) for name in laws}
     return [f - g for f, g in zip(_shown(fine, own, scatter), _shown(problem, lumped, {}), strict=True)]
 

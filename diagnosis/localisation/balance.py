@@ -115,7 +115,7 @@ def _driven(run: Simulation, values: Array, cells: NDArray[np.int64]) -> NDArray
 
 def _shows_its_place(reading: Reading) -> bool:
     """Whether a channel shows no more than the temperatures at its place so far: what lags does, too."""
-    return all(law.asleep or law.mechanism.along_time for law in reading.effects)
+    return all(law.disabled or law.mechanism.along_time for law in reading.effects)
 
 
 def _excesses(fitted: Fitted, run: Simulation, reach: _Reach, channel: str) -> Iterator[tuple[int, float, float]]:

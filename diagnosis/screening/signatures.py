@@ -36,16 +36,16 @@ EVEN_STEPS = 1e-6  # of the longest, by which steps of an even grid differ
 
 
 @dataclass(frozen=True)
-class Asleep:
-    """`amplitudes` numbers, by candidate, the parameters of `network` that would wake it; `left_out` says why not."""
+class DisabledNetwork:
+    """`amplitudes` numbers, by candidate, the parameters that enable it; `left_out` says why a candidate has none."""
 
     network: Network
     amplitudes: Mapping[str, tuple[int, ...]]
     left_out: Mapping[str, str]
 
 
-def asleep(machine: Machine, part: TwinPart, candidates: Sequence[Candidate]) -> Asleep:
-    """The machine's network with all candidates that have values to be off at; `left_out` says which do not compile."""
+def with_disabled(machine: Machine, part: TwinPart, candidates: Sequence[Candidate]) -> DisabledNetwork:
+    """The machine's network with all candidates that have amplitudes, each disabled."""
     smooth = [c for c in candidates if c.amplitudes]
     left_out: dict[str, str] = {}
     try:
@@ -59,7 +59,7 @@ def asleep(machine: Machine, part: TwinPart, candidates: Sequence[Candidate]) ->
         smooth = [c for c in smooth if c.name not in left_out]
         network = compile_network(machine, part=_with(part, smooth))
     names = {_instance(c) for c in smooth}
-    network = _sleeping(network, names)
+    network = _disabled(network, names)
     found: dict[str, list[int]] = defaultdict(list)
     parameters = list(network.parameters)
     by_mark = {(_instance(c), a): [] for c in smooth for a in c.amplitudes}  # type: dict[tuple[str, str], list[str]]
@@ -82,7 +82,7 @@ def asleep(machine: Machine, part: TwinPart, candidates: Sequence[Candidate]) ->
         for name in by_mark[instance, amplitude]:
             if _is_of(owner[name], p):
                 found[name].append(j)
-    return Asleep(
+    return DisabledNetwork(
         replace(network, parameters=tuple(parameters)), {k: tuple(v) for k, v in sorted(found.items())}, left_out
     )
 
@@ -97,7 +97,7 @@ def _with(part: TwinPart, candidates: Sequence[Candidate]) -> TwinPart:
         first = members[0]
         assert first.part is not None
         mechanism = MECHANISMS[first.mechanism]
-        values = {**first.part.parameters, **{k: Value(value=v) for k, v in mechanism.ghost.items()}}
+        values = {**first.part.parameters, **{k: Value(value=v) for k, v in mechanism.null_values.items()}}
         for amplitude, off in first.amplitudes.items():
             near = mechanism.spec(amplitude).scale == "logit" and off <= 0
             values[amplitude] = Value(value=NEARLY_OFF if near else off, source=f"{AMPLITUDE_OF}{name}.{amplitude}")
@@ -126,18 +126,18 @@ def _free(p: Parameter) -> Parameter:
     return replace(p, free=True, scale="linear", spread=1.0, low=-np.inf, high=np.inf, source="")
 
 
-def _sleeping(network: Network, names: set[str]) -> Network:
-    """The laws of these names put to sleep; heat that one of them multiplies stays awake without it."""
+def _disabled(network: Network, names: set[str]) -> Network:
+    """The network with the laws of these names disabled; heat that one of them multiplies stays enabled without it."""
 
     def put(law: Law) -> Law:
-        return replace(law, asleep=True) if law.name in names else law
+        return replace(law, disabled=True) if law.name in names else law
 
     heats: list[Heat] = []
     for heat in network.heats:
-        awake = tuple(f for f in heat.factors if f.name not in names)
-        base = replace(heat, law=put(heat.law), factors=awake)
+        enabled = tuple(f for f in heat.factors if f.name not in names)
+        base = replace(heat, law=put(heat.law), factors=enabled)
         heats.append(base)
-        heats += [replace(base, factors=(*awake, put(f))) for f in heat.factors if f.name in names]
+        heats += [replace(base, factors=(*enabled, put(f))) for f in heat.factors if f.name in names]
     return replace(
         network,
         heats=tuple(heats),
@@ -182,11 +182,11 @@ def signatures(at: Point, every: Sequence[Candidate], known: Signatures | None =
         names = {c.name for c in every}
         kept = replace(known, of={n: c for n, c in known.of.items() if n in names})
         return kept.joined(signatures(at, new)) if new else kept
-    found = asleep(at.machine, at.part, every)
+    found = with_disabled(at.machine, at.part, every)
     problem = on_network(at.problem, at.batches, found.network)
     fitted = {u.name for u in at.problem.unknowns}
-    waking = sorted({j for js in found.amplitudes.values() for j in js})
-    numbers = [j for j in waking if found.network.parameters[j].name not in fitted]
+    amplitudes = sorted({j for js in found.amplitudes.values() for j in js})
+    numbers = [j for j in amplitudes if found.network.parameters[j].name not in fitted]
     x = x_of(problem.unknowns, carried_z(at.problem, problem, at.z))
     smooth = list(problem.columns(x, carried_nuisances(at.problem, problem, at.nuisance), numbers))
     finite, refused = differences(at, every)

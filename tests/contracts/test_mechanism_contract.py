@@ -276,12 +276,12 @@ def does_nothing(point: Point) -> bool:
 
 def test_what_a_diagnosis_sets_is_a_parameter_within_its_bounds(c: Given) -> None:
     m, off = c.m, c.m.off or {}
-    assert {*off, *m.shape, *m.ghost, *m.of_port} <= {s.name for s in m.parameters}
-    assert not set(off) & {*m.shape, *m.ghost}
+    assert {*off, *m.shape, *m.null_values, *m.of_port} <= {s.name for s in m.parameters}
+    assert not set(off) & {*m.shape, *m.null_values}
     scanned = [(name, value) for name, values in m.scan.items() for value in values]
     assert len(set(scanned)) == len(scanned)
     scanned += [pair for point in m.scan_points for pair in point.items()]
-    for name, value in (*off.items(), *m.ghost.items(), *scanned):
+    for name, value in (*off.items(), *m.null_values.items(), *scanned):
         assert m.spec(name).low <= value <= m.spec(name).high, (name, value)
     assert all(value != m.spec(name).value for name, value in scanned)
 
@@ -342,13 +342,14 @@ def test_a_structural_one_switched_off_leaves_the_network_as_it_was(c: Given) ->
             assert (other.matrix(after.values)[n:] == 0).all()
 
 
-def test_a_ghost_hardly_loads_its_neighbours_and_is_as_late(c: Given) -> None:
-    if c.structural and c.m.ghost:
-        before, usual, ghost = compile_network(c.without), network_with(c.m), network_with(c.m, c.named(c.m.ghost))
+def test_at_null_values_it_hardly_loads_its_neighbours_and_is_as_late(c: Given) -> None:
+    if c.structural and c.m.null_values:
+        before, usual = compile_network(c.without), network_with(c.m)
+        null = network_with(c.m, c.named(c.m.null_values))
         n = before.n_cells
-        G = ghost.conductance_W_per_K(ghost.values)[:n, :n]
+        G = null.conductance_W_per_K(null.values)[:n, :n]
         assert_allclose(G, before.conductance_W_per_K(before.values), rtol=1e-3, atol=1e-12)
-        late, wanted = (w.conductance_W_per_K(w.values)[n, n] / w.capacity_J_per_K(w.values)[n] for w in (ghost, usual))
+        late, wanted = (w.conductance_W_per_K(w.values)[n, n] / w.capacity_J_per_K(w.values)[n] for w in (null, usual))
         assert late == pytest.approx(wanted, rel=1e-6)
 
 

@@ -19,7 +19,7 @@ from diagnosis.candidates.library import HINTS, candidates, equipment_named, lin
 from diagnosis.contracts import Candidate, Where
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import proposed
-from diagnosis.screening.signatures import asleep, differences
+from diagnosis.screening.signatures import differences, with_disabled
 from diagnosis.search.search import search
 from tests.diagnosis.small_cases import equipped, fitted, four_bodies, runs, two_bodies
 from twin.compile import compile_network
@@ -409,5 +409,5 @@ def test_a_sag_is_stated_at_the_other_ones_full_level(range_: list[float] | None
     machine = board(range_)
     part = twin_part(machine)
     sags = [c for c in candidates(machine, part, ["supply_sag"]) if c.part and c.part.drivers == {"other": "other"}]
-    network = asleep(machine, part, sags).network
+    network = with_disabled(machine, part, sags).network
     assert network.values[network.index("mechanisms.supply_sag_heat_other.rated")] == level

@@ -311,7 +311,7 @@ class CalibrationProblem:
     @cached_property
     def _heats(self) -> list[tuple[str, ...]]:
         """The heat laws that each varying parameter scales."""
-        laws = [h.law for h in self.network.heats if not h.asleep]
+        laws = [h.law for h in self.network.heats if not h.disabled]
         return [tuple(w.name for w in laws if k in w.parameters.values()) for k in self.nuisances.parameters]
 
     def own_deviations(self, nuisance: Sequence[Array]) -> Array:

@@ -80,7 +80,7 @@ class Mechanism(ABC):
     # What a diagnosis needs
     off: ClassVar[Mapping[str, float] | None]  # what scales the effect, at the values without one; None: nothing does
     shape: ClassVar[tuple[str, ...]] = ()  # parameters that change its form in time or over drivers, not its size
-    ghost: ClassVar[Mapping[str, float]] = {}  # values at which a structural mechanism hardly affects its neighbours
+    null_values: ClassVar[Mapping[str, float]] = {}  # of a structural mechanism that is disabled
     fault: ClassVar[bool] = False  # True: of a sensor or a clock, no physics of the machine
     port_roles: ClassVar[Mapping[str, PortRole]] = {}  # of every port; the usual ones need not be stated
     together: ClassVar[int] = 1  # how many targets one instance acts on

@@ -97,7 +97,7 @@ class MandrelFixture(Mechanism):
     off: ClassVar[Mapping[str, float]] = {"gain": 0.0}
     shape = ("capacity", "conductance", "film")
     # a thousandth of the usual: as late as it
-    ghost: ClassVar[Mapping[str, float]] = {"capacity": 2.0, "conductance": 0.003, "film": 0.0005}
+    null_values: ClassVar[Mapping[str, float]] = {"capacity": 2.0, "conductance": 0.003, "film": 0.0005}
     of_port: ClassVar[Mapping[str, tuple[str, float | None]]] = {"conductance": ("seat", None), "film": ("air", None)}
     port_roles: ClassVar[Mapping[str, PortRole]] = {"seat": "body"}
 

@@ -124,7 +124,7 @@ def _finer(
     network: Network, values: Array, inputs: Inputs, regimes: Regimes
 ) -> tuple[Regimes, Array, NDArray[np.int64], tuple[Heat, ...]]:
     """Regimes in which driven heats hold as well; their watts, the given regime of each, and the remaining heats."""
-    driven = [h for h in network.heats if not h.temperature_dependent and not h.asleep]
+    driven = [h for h in network.heats if not h.temperature_dependent and not h.disabled]
     held = [h for h in driven if not _timed(h) and h.law.name not in inputs.times]
     number, first = distinct(
         inputs, [c for h in held for law in (h.law, *h.factors) for c in law.drivers.values()], regimes.of
@@ -333,9 +333,9 @@ Source = HeatSource | ExchangeSource
 
 
 def sources_of(balance: Balance, places: Places) -> tuple[list[Source], list[HeatSource]]:
-    """All temperature-dependent heat of a balance, and that asleep; their places are added to `places`."""
-    awake: list[Source] = []
-    asleep: list[HeatSource] = []
+    """Temperature-dependent heat sources of a balance, enabled and disabled; their places are added to `places`."""
+    enabled: list[Source] = []
+    disabled: list[HeatSource] = []
     for heat in balance.network.heats:
         if heat.temperature_dependent:
             numbers = {
@@ -345,11 +345,11 @@ def sources_of(balance: Balance, places: Places) -> tuple[list[Source], list[Hea
                 if port.cells is not None
             }
             source = HeatSource(balance, heat, numbers)
-            if heat.asleep:
-                asleep.append(source)
+            if heat.disabled:
+                disabled.append(source)
             else:
-                awake.append(source)
+                enabled.append(source)
     for edge in balance.network.edges:
         if set(edge.factors) & set(balance.regimes.varying):
-            awake.append(ExchangeSource(balance, edge, places.number(edge.direction)))
-    return awake, asleep
+            enabled.append(ExchangeSource(balance, edge, places.number(edge.direction)))
+    return enabled, disabled

@@ -54,7 +54,7 @@ class Rows:
         self, law: Law, effect: str, seen: Numeric | None, tangents: Tangents | None, d_seen: Numeric | None
     ) -> Any:
         """A law's effect (P, B, K) on its input `seen`, and, with tangents, its derivative (Q, B, K), else None."""
-        if law.asleep and tangents is None:
+        if law.disabled and tangents is None:
             return seen if seen is not None else np.zeros((1, 1, 1)), None
         degC = {role: self._port(port) for role, port in law.ports.items()}
         shape = (len(self.values), *self.time_s.shape)
@@ -62,7 +62,7 @@ class Rows:
         if tangents is None:
             return out, None
         d_out = np.zeros((tangents.degC.shape[1], *self.time_s.shape))
-        if law.asleep:  # its input passes unchanged
+        if law.disabled:  # its input passes unchanged
             out, d_out = (out, d_out) if seen is None or d_seen is None else (seen, d_seen.copy())
         else:
             self._pass_on(law, effect, (seen, degC), (d_seen, self._tangents_of(law, tangents)), d_out)

@@ -35,7 +35,7 @@ class Solved:
     response: Response
     coupled: Coupled | None
     states: States
-    asleep: Sequence[HeatSource] = ()  # heat of candidates, which does not count
+    disabled: Sequence[HeatSource] = ()  # heat of candidates, which has no effect
 
 
 @np.errstate(over="ignore", invalid="ignore")  # at values that no machine has; what is not finite is refused
@@ -47,7 +47,7 @@ def solved_balance(
     The states of a linear network stand at every `every`-th border, of another at all of them.
     """
     balance, places = balance_of(network, values, inputs), Places()
-    sources, asleep = sources_of(balance, places)
+    sources, disabled = sources_of(balance, places)
     n_places = len(places.rows)
     watch(network, places)
     excess = excess_K(network, values, inputs)
@@ -56,12 +56,12 @@ def solved_balance(
     if not sources:
         response = Response(plain_modes(balance), balance.schedule)
         states = response.run(balance.forcing(response), start_degC, every)
-        return Solved(balance, sources, places, start_degC, response, None, states, asleep)
+        return Solved(balance, sources, places, start_degC, response, None, states, disabled)
     rows = np.array(places.rows[:n_places]).reshape(n_places, network.n_cells)
     coupled = solve(balance, sources, rows, start_degC, tolerance_K)
     response = Response(coupled.chord.modes, balance.schedule)
     heat = balance.forcing(response) + response.forcing(balance.directions(sources), coupled.series_W)
-    return Solved(balance, sources, places, start_degC, response, coupled, response.run(heat, start_degC), asleep)
+    return Solved(balance, sources, places, start_degC, response, coupled, response.run(heat, start_degC), disabled)
 
 
 def rows_of(solved: Solved, states_every: int) -> Rows:

@@ -367,13 +367,13 @@ def regimes_of(network: Network, values: Array, inputs: Inputs) -> Regimes:
     fixed: list[int] = []
     number, first = distinct(inputs, ())
     for k, law in enumerate(network.factors):
-        if law.asleep or reads_time(law, "factor"):
+        if law.disabled or reads_time(law, "factor"):
             continue
         channels = [c for j in (*fixed, k) for c in network.factors[j].drivers.values()]
         finer, at = distinct(inputs, channels)
         if len(at) <= MOST:
             fixed, number, first = [*fixed, k], finer, at
-    varying = tuple(k for k, law in enumerate(network.factors) if k not in fixed and not law.asleep)
+    varying = tuple(k for k, law in enumerate(network.factors) if k not in fixed and not law.disabled)
     factor = np.ones((len(values), len(first), len(network.factors)))
     for k in fixed:
         factor[..., k] = at_tuples(network.factors[k], "factor", values, inputs, first)

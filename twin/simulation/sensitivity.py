@@ -119,7 +119,7 @@ class UnknownsOf:
         self._add(out, edge.direction, slope[..., None] * lead)
 
     def _heats(self, out: Unknown, j: int) -> None:
-        sources = [s for s in (*self.solved.sources, *self.solved.asleep) if isinstance(s, HeatSource)]
+        sources = [s for s in (*self.solved.sources, *self.solved.disabled) if isinstance(s, HeatSource)]
         by_heat = {id(s.heat): s for s in sources}
         every = slice(0, self.shape[1])
         for heat in self.heats[j]:
@@ -187,8 +187,8 @@ def _by_parameter(network: Network) -> tuple[dict[int, list[Edge]], dict[int, li
         for j in {k for k, _ in edge.conductance.powers}.union(*(law.parameters.values() for law in laws)):
             edges[j].append(edge)
     for heat in network.heats:
-        if heat.asleep:  # its twin that is awake has the other parameters
-            for j in {k for law in (heat.law, *heat.factors) if law.asleep for k in law.parameters.values()}:
+        if heat.disabled:  # its enabled copy has the other parameters
+            for j in {k for law in (heat.law, *heat.factors) if law.disabled for k in law.parameters.values()}:
                 heats[j].append(heat)
             continue
         shares = {o.share for o in heat.outlets if o.share is not None}

@@ -13,7 +13,7 @@ import pytest
 import signatures_heat
 
 from diagnosis.candidates.library import candidates
-from diagnosis.screening.signatures import asleep
+from diagnosis.screening.signatures import with_disabled
 from tests.contracts import test_mechanism_contract as contract
 from tests.toys.small_machine import BODIES, machine_with
 from twin.mechanisms import MECHANISMS
@@ -56,7 +56,7 @@ def test_a_diagnosis_considers_it() -> None:
     proposed = candidates(machine, part, [KEY])
     assert [c.name for c in proposed] == [f"{KEY}_{body}_feed_driver" for body in sorted(BODIES[1:])]
     assert [c.label for c in proposed[:1]] == [f"friction of the wipers: {sorted(BODIES[1:])[0]} (feed_driver)"]
-    found = asleep(machine, part, proposed)
+    found = with_disabled(machine, part, proposed)
     assert not found.left_out and set(found.amplitudes) == {c.name for c in proposed}
     every = candidates(machine, part)
     assert {c.name for c in proposed} < {c.name for c in every}

@@ -1,4 +1,4 @@
-"""A network with every candidate asleep: it is the baseline, and its derivatives are what each candidate would do."""
+"""A network with every candidate disabled: it is the baseline, and its derivatives are what each candidate would do."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from data.arrays import Array
 from data.machine import Machine
 from diagnosis.candidates.library import candidates
 from diagnosis.contracts import Candidate, Where
-from diagnosis.screening.signatures import asleep
+from diagnosis.screening.signatures import with_disabled
 from tests.diagnosis.small_cases import driven, equipped, four_bodies, two_bodies
 from twin.compile import compile_network
 from twin.mechanisms import MECHANISMS
@@ -65,13 +65,13 @@ class Small:
         return np.concatenate(slopes, axis=-1)
 
     def difference(self, c: Candidate, amplitude: str, substeps: int = SUBSTEPS) -> Array:
-        """The same by simulations with this candidate alone, awake at a thousandth of its usual size."""
+        """The same by simulations with this candidate alone, enabled at a thousandth of its usual size."""
         mechanism, off = MECHANISMS[c.mechanism], c.amplitudes[amplitude]
         spec = mechanism.spec(amplitude)
         step = 1e-3 * float(spec.value or spec.spread)
 
         def at(value: float) -> Array:
-            values = {**mechanism.ghost, **c.amplitudes, amplitude: value}
+            values = {**mechanism.null_values, **c.amplitudes, amplitude: value}
             least = {a: max(v, 1e-12) if mechanism.spec(a).scale == "logit" else v for a, v in values.items()}
             return self.shown(self.network(c, least), substeps)
 
@@ -100,7 +100,7 @@ def one_of_each(every: list[Candidate]) -> list[Candidate]:
 
 def compared(small: Small, chosen: list[Candidate], substeps: int) -> list[tuple[float, str]]:
     """The largest error of every derivative, of its own size."""
-    found = asleep(small.machine, small.part, small.candidates)
+    found = with_disabled(small.machine, small.part, small.candidates)
     numbers = sorted({j for js in found.amplitudes.values() for j in js})
     slopes = dict(zip(numbers, small.slopes(found.network, numbers, substeps), strict=True))
     out = []
@@ -123,7 +123,7 @@ def compared(small: Small, chosen: list[Candidate], substeps: int) -> list[tuple
 @pytest.mark.parametrize(
     "small", [SMALL["two bodies"], pytest.param(SMALL["four bodies"], marks=pytest.mark.slow)], ids=SMALL
 )
-def test_its_derivatives_are_those_of_the_candidates_awake(small: Small) -> None:
+def test_its_derivatives_are_those_of_the_enabled_candidates(small: Small) -> None:
     chosen = [c for c in one_of_each(smooth(small)) if c.mechanism != "jacket_chiller"]
     assert len(chosen) > 20
     gaps = compared(small, chosen, SUBSTEPS)
@@ -138,31 +138,31 @@ def test_a_thermostats_derivative_is_right_in_fine_steps() -> None:
 
 
 @machines
-def test_with_everything_asleep_it_is_the_baseline(small: Small) -> None:
-    every = [c for c in smooth(small) if not MECHANISMS[c.mechanism].ghost]
-    network = asleep(small.machine, small.part, every).network
+def test_with_everything_disabled_it_is_the_baseline(small: Small) -> None:
+    every = [c for c in smooth(small) if not MECHANISMS[c.mechanism].null_values]
+    network = with_disabled(small.machine, small.part, every).network
     np.testing.assert_allclose(small.shown(network), small.shown(small.network()), rtol=0, atol=1e-12)
 
 
 @machines
-def test_ghosts_hardly_load_it(small: Small) -> None:
-    ghosts = [c for c in smooth(small) if MECHANISMS[c.mechanism].ghost]
-    network = asleep(small.machine, small.part, ghosts).network
+def test_structures_at_null_values_hardly_load_it(small: Small) -> None:
+    structures = [c for c in smooth(small) if MECHANISMS[c.mechanism].null_values]
+    network = with_disabled(small.machine, small.part, structures).network
     gap = np.abs(small.shown(network) - small.shown(small.network()))
-    assert ghosts and 0 < gap.max() < 2e-3
+    assert structures and 0 < gap.max() < 2e-3
 
 
-def test_heat_that_a_sleeping_factor_multiplies_stays_awake() -> None:
+def test_heat_that_a_disabled_factor_multiplies_stays_enabled() -> None:
     small = SMALL["four bodies"]
     feedback = next(c for c in smooth(small) if c.mechanism == "viscosity_feedback")
-    base, network = small.network(), asleep(small.machine, small.part, [feedback]).network
+    base, network = small.network(), with_disabled(small.machine, small.part, [feedback]).network
     own = [h for h in network.heats if h.law.name == "friction"]
-    assert [h.asleep for h in own] == [False, True]
+    assert [h.disabled for h in own] == [False, True]
     assert [len(h.factors) for h in own] == [0, 1]
     name = "mechanisms.friction.lubrication"
-    awake = small.slopes(network, [network.index(name)])
-    np.testing.assert_allclose(awake, small.slopes(base, [base.index(name)]), atol=1e-12)
-    assert np.abs(awake).max() > 0.1
+    slopes = small.slopes(network, [network.index(name)])
+    np.testing.assert_allclose(slopes, small.slopes(base, [base.index(name)]), atol=1e-12)
+    assert np.abs(slopes).max() > 0.1
 
 
 def test_every_error_of_a_shared_instance_has_its_own_amplitude() -> None:
@@ -173,7 +173,7 @@ def test_every_error_of_a_shared_instance_has_its_own_amplitude() -> None:
     assert "y" not in channels
     small = Small(machine)
     bars = [c for c in smooth(small) if c.name in ("mandrel_fixture_z_head", "mandrel_fixture_y_head")]
-    found = asleep(machine, small.part, bars)
+    found = with_disabled(machine, small.part, bars)
     (y,), (z,) = (found.amplitudes[c.name] for c in sorted(bars, key=lambda c: c.name))
     of_y, of_z = small.slopes(found.network, [y, z])
     order = [e.channel for e in found.network.errors]
@@ -188,16 +188,16 @@ def test_what_does_not_compile_is_told_and_the_rest_stays() -> None:
     good = next(c for c in smooth(small) if c.mechanism == "cabinet_heat")
     assert good.part is not None
     bad = replace(good, name="cabinet_heat_hood", part=good.part.model_copy(update={"into": "hood"}))
-    found = asleep(small.machine, small.part, [good, bad])
+    found = with_disabled(small.machine, small.part, [good, bad])
     assert set(found.amplitudes) == {good.name}
     assert list(found.left_out) == [bad.name]
     assert "mechanisms.cabinet_heat_hood.into" in found.left_out[bad.name] and "'hood'" in found.left_out[bad.name]
 
 
-def test_a_candidate_without_an_amplitude_is_not_asleep_but_absent() -> None:
+def test_a_candidate_without_an_amplitude_is_absent_from_the_network() -> None:
     small = SMALL["two bodies"]
     part = MechanismPart(law="sensor_swap", acts_on=("t_shaft", "t_head"))
     swap = Candidate("sensor_swap", Where("sensor", "t_shaft"), "swap", "two labels exchanged", part, fault=True)
-    found = asleep(small.machine, small.part, [swap])
+    found = with_disabled(small.machine, small.part, [swap])
     assert not found.amplitudes and not found.left_out
     assert found.network.parameters == small.network().parameters
