@@ -53,7 +53,7 @@ from diagnosis.fitting.fitted import (
 )
 from diagnosis.localisation.balance import impossible
 from diagnosis.localisation.where_when import Located, locate
-from diagnosis.next_experiment.proposal import NOTHING, Proposal, revealing_run, settling_run
+from diagnosis.next_experiment.proposal import NOTHING, Proposal, deciding_run, revealing_run
 from diagnosis.policy import POLICY
 from diagnosis.result import Diagnosis
 from diagnosis.screening.screen import limits
@@ -170,7 +170,7 @@ def _diagnosis(
         worse = worsened(rows_as_given(on_all_rows(done.baseline, batches)), left_out_rows(written))
     if worse:
         remarks += (f"the machine file keeps its values and parts: the fitted ones raise {made.rises(worse, units)}",)
-    run, possible = settling_run(named), []
+    run, possible = deciding_run(named), []
     separates = run.label if run is not None else ""
     found = []
     for r, left in pairs:

@@ -92,7 +92,7 @@ def filtered_each(
 
     Under each of several uncertainties, which share the simulation and its linearisation. Sensors in the network's
     order; NaN is no reading. The rows are the recording's; only every `thin`-th row's readings are used, from the
-    first on, and the rows behind it keep its corrections. `start_degC` (B, N) is the mean of the start, default settled
+    first on, and the rows behind it keep its corrections. `start_degC` (B, N) is the mean of the start, default steady
     with the surroundings.
 
     Raises:
@@ -101,7 +101,7 @@ def filtered_each(
     for doubt in doubts:
         _check(network, inputs, readings, doubt)
     if start_degC is None:
-        start_degC = start_of(network, values, inputs, settled=True)
+        start_degC = start_of(network, values, inputs, steady=True)
     solved = solved_balance(network, values[None], inputs, start_degC[None], TOLERANCE_K)
     rows = rows_of(solved, 1)
     nominal = simulation_of(solved, *shown(rows, network)[:2], TOLERANCE_K, 1)

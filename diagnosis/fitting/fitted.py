@@ -38,15 +38,15 @@ from twin.calibration.least_squares import (
     FitOptions,
     State,
     annealed,
+    converge,
     likelier,
     misfits,
     noise_left,
-    settled,
     x_of,
     z_bounds,
 )
 from twin.calibration.problem import CalibrationProblem
-from twin.calibration.recorder import settled_with_lead
+from twin.calibration.recorder import converge_with_lead
 from twin.compile import compile_network
 from twin.schema import TwinPart
 from twin.simulation.inputs import acting
@@ -117,10 +117,10 @@ def _calibrated_first(
         return CalibrationProblem.of(network, coarse(batches, every_s, lead), every_s)
 
     if lead_rows is None:
-        lead_rows, problem, state, _ = settled_with_lead(machine, problem_at, options, alike)
+        lead_rows, problem, state, _ = converge_with_lead(machine, problem_at, options, alike)
     else:
         problem = problem_at(lead_rows)
-        state, _ = settled(problem, options, noise=alike)
+        state, _ = converge(problem, options, noise=alike)
     own = tuple(coarse(batches, every_s, lead_rows))
     return Point(machine, part, own, problem, state.z, state.nuisance, lead_rows)
 
@@ -185,7 +185,7 @@ def afresh(now: Fitted, part: TwinPart) -> Fitted:
     """
     problem = on_network(now.problem, now.batches, compile_network(now.machine, part=part), free_starts=True)
     options, alike = _first_calibration(len(problem.channels))
-    state, _ = settled(problem, options, noise=alike)
+    state, _ = converge(problem, options, noise=alike)
     at = Point(now.machine, part, now.batches, problem, state.z, state.nuisance, now.lead_rows)
     return replace(_under_own(now, at, Hyper(*POLICY.first_hyper)), base=now)
 
@@ -361,7 +361,7 @@ def relinearised(fitted: Fitted, steps: int = POLICY.fit_steps) -> Fitted:
             return here
         fallen, z, cost, damping = cost - then, moved, then, damping / POLICY.damping_factor**2
         here = at(z, left)
-        if fallen < 2.0 * POLICY.telling_nats:
+        if fallen < 2.0 * POLICY.negligible_nats:
             return here
     return here
 
@@ -399,7 +399,7 @@ def _elsewhere(fitted: Fitted) -> State:
     problem, base, tolerance = fitted.problem, fitted.base, POLICY.fit_tolerance_nats
     if base is None:
         options = FitOptions(max_iterations=POLICY.plain_steps, tolerance=tolerance, reweight=True)
-        return settled(problem, options)[0]
+        return converge(problem, options)[0]
     one = plain(base)
     z = carried_z(one.problem, problem, one.z, fitted.z)
     state = State.at(problem, z, carried_nuisances(one.problem, problem, one.nuisance), one.noise)

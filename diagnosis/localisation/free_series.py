@@ -20,7 +20,7 @@ from data.errors import WorkError
 from diagnosis.localisation.linearised import FitRows, ForcedNetwork, Hats, Optimum, on_channels
 from diagnosis.policy import POLICY
 from twin.calibration.fit_problem import Noise
-from twin.calibration.least_squares import SETTLED
+from twin.calibration.least_squares import CONVERGED
 from twin.calibration.problem import CalibrationProblem
 
 Indices = NDArray[np.int64]
@@ -329,7 +329,7 @@ class PlaceSearch:
         noise = self.noise
         for _ in range(POLICY.place_noise_rounds):
             found = self.fitted.optimum(series, noise.weight)
-            if found.noise.change(noise) < SETTLED:
+            if found.noise.change(noise) < CONVERGED:
                 break
             noise = found.noise
         return found
@@ -372,8 +372,8 @@ class Point:
         return cls(problem, x, tuple(nuisance), hats, forced, search)
 
     @property
-    def settled(self) -> bool:
-        return self.last_step < POLICY.linear_step_settled_sd
+    def converged(self) -> bool:
+        return self.last_step < POLICY.linear_step_converged_sd
 
     def moved(self, held: Sequence[Held]) -> Point:
         """To the optimum given what is held, with the noise that is left there; with nothing held, the noise alone."""

@@ -226,7 +226,7 @@ def locate(
         say("locate", number, POLICY.linearisations)
         point = point.moved(held)
         held = point.search.forward(most)
-        if point.settled:
+        if point.converged:
             break
     found = tuple(_found(point.search, held, k) for k in range(len(held)))
     table = _map(point.search, held, regimes_of(batches), [b.time_s for b in batches])

@@ -164,7 +164,7 @@ def _before(fitted: Fitted, runs: Sequence[Run], finer: int) -> Array:
         different += [] if same else [run.preparation]
     inputs = _side_by_side(fitted, different).refined(finer)
     network = fitted.problem.network
-    start = start_of(network, fitted.values, inputs, settled=True)
+    start = start_of(network, fitted.values, inputs, steady=True)
     cells = simulate(network, fitted.values, inputs, start[None], keep_cells=True).cells_degC
     assert cells is not None
     last = inputs.n_intervals // inputs.every

@@ -27,7 +27,7 @@ class Run:
     """One run: what the machine does in `stages`, after what it did `before`, which is not recorded.
 
     `label` names it in a sentence: "… would distinguish them". `surroundings` are the recorded channels over time; rows
-    and changes stand on multiples of `row_s`. `clock_h` is the time of day at which it begins, `settled_degC` where a
+    and changes stand on multiples of `row_s`. `clock_h` is the time of day at which it begins, `initial_degC` where a
     machine without recorded surroundings has stood.
     """
 
@@ -37,7 +37,7 @@ class Run:
     row_s: float
     before: tuple[Stage, ...]
     clock_h: float = POLICY.morning_h
-    settled_degC: float = 20.0
+    initial_degC: float = 20.0
 
     @property
     def hours(self) -> float:
@@ -60,7 +60,7 @@ class Run:
         return replace(self, label=f"before {self.label}", stages=self.before, surroundings=held)
 
     def plan(self, machine: Machine, start: Mapping[str, float] | None = None) -> RunPlan:
-        """The run on its rows; `start` has bodies' temperatures, degC, all others begin at `settled_degC`."""
+        """The run on its rows; `start` has bodies' temperatures, degC, all others begin at `initial_degC`."""
         counts = [round(s.seconds / self.row_s) for s in self.stages]
         time_s = self.row_s * np.arange(sum(counts) + 1.0)
         drivers = {n: np.zeros(sum(counts)) for n in machine.names("driver", "position")}
@@ -70,7 +70,7 @@ class Run:
             for name, value in held.items():
                 drivers[name][begin : begin + count] = value
         air = {n: np.interp(time_s, *np.transpose(points)) for n, points in self.surroundings.items()}
-        return RunPlan(self.label, time_s, drivers, air, dict(start or {}), self.settled_degC, self.row_s)
+        return RunPlan(self.label, time_s, drivers, air, dict(start or {}), self.initial_degC, self.row_s)
 
     def text(self, start: Mapping[str, float] | None = None, comments: Sequence[str] = ()) -> str:
         """The run as a run plan file, which reads back as `plan(machine, start)`; `comments` stand above it."""
@@ -83,7 +83,7 @@ class Run:
             given["surroundings"] = {n: _points(points) for n, points in self.surroundings.items()}
             given["start"] = _plains(start) if start else "settled"
         else:
-            given["start"] = f"{self.settled_degC:g} degC"
+            given["start"] = f"{self.initial_degC:g} degC"
         body = yaml.safe_dump(given, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
         return "".join(f"# {line}\n" for line in comments) + body
 
@@ -127,7 +127,7 @@ class _Shop:
     switches: frozenset[str]  # drivers that are on or off
     rest: Mapping[str, float | None]  # where a driver stands while another runs
     room_degC: Mapping[str, float]  # by recorded surrounding
-    settled_degC: float
+    initial_degC: float
 
     @classmethod
     def of(cls, machine: Machine, batches: Sequence[Batch], row_s: float) -> _Shop:
@@ -147,10 +147,10 @@ class _Shop:
         room = {n: _half(float(np.median(v))) for n in machine.names("ambient") if len(v := _recorded(batches, n))}
         sensed = [v[0] for n in machine.names("temperature") for b in batches if len(v := _recorded([b], n))]
         order = sorted(room, key=lambda n: n != "room")
-        settled = room[order[0]] if order else _half(float(np.median(sensed))) if sensed else 20.0
+        initial_degC = room[order[0]] if order else _half(float(np.median(sensed))) if sensed else 20.0
         pace = min(1.0, longest_h / POLICY.short_recording_h)
         return cls(
-            machine, row_s, pace, highest, frozenset(switches), rest, room, settled
+            machine, row_s, pace, highest, frozenset(switches), rest, room, initial_degC
         )  # fmt: skip
 
     def turning(self, name: str) -> Iterator[Run]:
@@ -202,7 +202,7 @@ class _Shop:
     ) -> Run:
         room = {n: ((0.0, T),) for n, T in self.room_degC.items()} if air is None else air
         stages_before = self._stages([(POLICY.rest_before_run_h, {}), *before])
-        return Run(label, self._stages(stages), room, self.row_s, stages_before, clock_h, self.settled_degC)
+        return Run(label, self._stages(stages), room, self.row_s, stages_before, clock_h, self.initial_degC)
 
     def _stages(self, given: Sequence[tuple[float, Mapping[str, float]]]) -> tuple[Stage, ...]:
         held = {n: v for n, v in self.rest.items() if v}

@@ -52,13 +52,13 @@ class Proposal:
             best = self.table.iloc[int(self.table["nats"].argmax())]
             return (
                 f"None of {len(self.table)} runs would distinguish them: the best, {best['run']}, is expected to give "
-                f"{few(self.nats)} nats, and {POLICY.telling_nats:g} is the least that counts."
+                f"{few(self.nats)} nats, and {POLICY.negligible_nats:g} is the least that counts."
             )
-        settled = "which settles it" if self.nats >= POLICY.settling_nats else f"{POLICY.settling_nats:g} settle it"
+        enough = "which is decisive" if self.nats >= POLICY.decisive_nats else f"{POLICY.decisive_nats:g} are decisive"
         left = [f" {a} and {b} would stay tied." for a, b in self.tied]
         return (
             f"{self.label[0].upper()}{self.label[1:]} would distinguish {listed(self.separates)}: {few(self.hours)} h, "
-            f"{few(self.nats)} nats expected, {settled}.{''.join(left)}"
+            f"{few(self.nats)} nats expected, {enough}.{''.join(left)}"
         )
 
 
@@ -83,12 +83,12 @@ def next_experiment(
 ) -> Proposal:
     """The run for two or more alternatives by name, the likeliest first; `runs` replace the menu.
 
-    Of runs that settle it the shortest, with its preparation, else the one that brings most of what is needed per hour.
+    Of the decisive runs the shortest, with its preparation, else the one that brings most of what is needed per hour.
     A pair that no run separates does not count.
 
     Args:
         lacking_nats: by alternative, what must be gained over the first before it is decided; default for all pairs:
-            `POLICY.settling_nats`.
+            `POLICY.decisive_nats`.
 
     Raises:
         ValueError: fewer than two alternatives, or alternatives that show different channels.
@@ -101,26 +101,26 @@ def next_experiment(
     if not runs:
         return _nothing([], np.zeros(0, bool), names)
     options = _options(foreseen(fits, runs), runs)
-    separable = np.max([o.pairs for o in options], axis=0) >= POLICY.telling_nats
+    separable = np.max([o.pairs for o in options], axis=0) >= POLICY.negligible_nats
     if not separable.any():
         return _nothing(options, separable, names)
     needed = _needed_nats(names, lacking_nats or {})
-    settling = [o for o in options if _settled(o, separable, needed) >= 1.0]
-    if settling:
-        best = min(settling, key=lambda o: (o.cost_h, -_least(o, separable)))
+    decisive = [o for o in options if _share_of(o, separable, needed) >= 1.0]
+    if decisive:
+        best = min(decisive, key=lambda o: (o.cost_h, -_least(o, separable)))
     else:
-        best = max(options, key=lambda o: _settled(o, separable, needed) / o.cost_h)
-    if _least(best, separable) < POLICY.telling_nats:  # no run does for all pairs: the one that does for the likeliest
+        best = max(options, key=lambda o: _share_of(o, separable, needed) / o.cost_h)
+    if _least(best, separable) < POLICY.negligible_nats:  # no run does for all pairs: best for the likeliest
         separable &= np.arange(len(separable)) == int(np.argmax(separable))
-        best = max(options, key=lambda o: _settled(o, separable, needed) / o.cost_h)
+        best = max(options, key=lambda o: _share_of(o, separable, needed) / o.cost_h)
     return _proposal(best, options, separable, names, fits[0])
 
 
 def _needed_nats(names: Sequence[str], lacking_nats: Mapping[str, float]) -> Array:
-    """What each pair (P,) must be apart: what the second lacks against the first, else what settles a tie."""
+    """What each pair (P,) must be apart: what the second lacks against the first, else what decides a tie."""
     return np.array(
         [
-            max(lacking_nats.get(second, 0.0) if first == names[0] else 0.0, POLICY.settling_nats)
+            max(lacking_nats.get(second, 0.0) if first == names[0] else 0.0, POLICY.decisive_nats)
             for first, second in combinations(names, 2)
         ]
     )
@@ -151,7 +151,7 @@ def _least(option: _Option, separable: Array) -> float:
     return float(option.pairs[separable].min())
 
 
-def _settled(option: _Option, separable: Array, needed: Array) -> float:
+def _share_of(option: _Option, separable: Array, needed: Array) -> float:
     """The least share of what the pairs need."""
     return float((option.pairs / needed)[separable].min())
 
@@ -215,7 +215,7 @@ def _table(options: Sequence[_Option], separable: Array, pairs: Sequence[tuple[s
     return table.sort_values("nats", ascending=False, kind="stable", ignore_index=True)
 
 
-def settling_run(named: Sequence[Round]) -> Proposal | None:
+def deciding_run(named: Sequence[Round]) -> Proposal | None:
     """For the first finding that is in doubt; None where none is, or nothing could be simulated."""
     for r in named:
         every, _, _ = explanations(r)
@@ -234,7 +234,7 @@ def settling_run(named: Sequence[Round]) -> Proposal | None:
 def revealing_run(done: Search) -> Proposal | None:
     """For the effects that gain most in the last round without being claimed, against none of them.
 
-    None where nothing gains, no run brings as much as settles a tie, or nothing could be simulated.
+    None where nothing gains, no run is decisive, or nothing could be simulated.
     """
     last = done.rounds[-1]
     if last.accepted:
@@ -244,15 +244,15 @@ def revealing_run(done: Search) -> Proposal | None:
         alternatives[t.candidate.label] = t.fitted
         lacking_nats[t.candidate.label] = last.threshold - t.gain
     run = _simulated(alternatives, lacking_nats) if len(alternatives) >= 2 else None
-    return run if run is not None and run.nats >= POLICY.settling_nats else None
+    return run if run is not None and run.nats >= POLICY.decisive_nats else None
 
 
 def possible(last: Round) -> list[Tried]:
-    """The effects that a round leaves possible, the likeliest of each cluster, best first: they gain more than settles
-    a tie, and most batches do not speak against them."""
+    """The effects that a round leaves possible, the likeliest of each cluster, best first: their gain is
+    decisive, and most batches do not speak against them."""
     out: dict[str, Tried] = {}
     for t in last.tried:
-        if t.candidate.change is None and t.gain >= POLICY.settling_nats and t.improved > len(t.by_run) / 2:
+        if t.candidate.change is None and t.gain >= POLICY.decisive_nats and t.improved > len(t.by_run) / 2:
             out.setdefault(t.cluster, t)
     return sorted(out.values(), key=lambda t: -t.gain)[: POLICY.separated_alternatives]
 

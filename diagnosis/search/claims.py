@@ -99,7 +99,7 @@ def alike(one: Tried, other: Tried) -> bool:
     """Whether a user acts on both explanations alike: recordings cannot distinguish them, or they are of one place and
     nearly as likely."""
     same_place = one.candidate.where == other.candidate.where
-    close = abs(one.standing - other.standing) < POLICY.settling_nats
+    close = abs(one.standing - other.standing) < POLICY.decisive_nats
     return one.cluster == other.cluster or (same_place and close)
 
 

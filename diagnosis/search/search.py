@@ -63,7 +63,7 @@ def _judged_together(
             done = one_round(less(full, rounds[k], baseline), workers, tell, rounds[k].screen)
         except (InputError, WorkError):
             continue  # no machine is without it
-        if done.best is not None and done.best.fitted.log_evidence < full.log_evidence - POLICY.telling_nats:
+        if done.best is not None and done.best.fitted.log_evidence < full.log_evidence - POLICY.negligible_nats:
             continue  # the effects as they were claimed explain more
         rounds[k] = done
         full = done.best.fitted if done.best is not None else done.before

@@ -15,7 +15,7 @@ from models.base import inner_groups
 from models.families.linear import Linear, Mask, Task
 from models.numerics.pooled_sums import FLAT
 
-_SETTLED = 1e-8  # of the scale: a step that moves predictions (RMS) and scale by less is the last
+_CONVERGED = 1e-8  # of the scale: a step that moves predictions (RMS) and scale by less is the last
 _MOST_STEPS = 500
 _EXACT = 1e-9  # of the target's size: a smaller scale is an exact fit
 _AT_ONCE = 1_000_000  # weights in memory
@@ -56,12 +56,12 @@ class Huber(Linear):
         epsilon = np.full(len(member), self.epsilons[0])
         if len(self.epsilons) > 1:
             epsilon = self._chosen(x, y_um, batch, member, task.scaled, free)
-        found = self._settled(x, y_um, member, epsilon, task.scaled, free)
+        found = self._minimised(x, y_um, member, epsilon, task.scaled, free)
         coef, intercept = found.beta[:, :-1], found.beta[:, -1]
         learned = {"epsilon": epsilon, "scale_um": found.scale, "far_share": found.far_share, "steps": found.steps}
         return coef, {"intercept_um": intercept + shift_y - coef @ shift_x, **learned}
 
-    def _settled(self, x: Array, y_um: Array, member: Mask, epsilon: Array, scaled: bool, free: bool) -> Settled:
+    def _minimised(self, x: Array, y_um: Array, member: Mask, epsilon: Array, scaled: bool, free: bool) -> Minimum:
         """Inputs x (n, p) and a column of ones, for the rows `member` (S, n) of S training sets.
 
         The coefficient of the ones is 0 unless the level is `free`.
@@ -74,7 +74,7 @@ class Huber(Linear):
         square = np.where(moves, square, 0.0)
         penalty = self.ridge * (square if scaled else np.broadcast_to(square.mean(axis=1, keepdims=True), square.shape))
         of_ones = np.zeros((len(member), 1))
-        return settle(np.hstack([x, np.ones((len(x), 1))]), y_um, member, epsilon, np.hstack([penalty, of_ones]),
+        return minimise(np.hstack([x, np.ones((len(x), 1))]), y_um, member, epsilon, np.hstack([penalty, of_ones]),
                       np.hstack([moves, np.full_like(of_ones, free, bool)]))  # fmt: skip
 
     def _chosen(self, x: Array, y_um: Array, batch: NDArray[np.int64], member: Mask, scaled: bool, free: bool) -> Array:
@@ -90,7 +90,7 @@ class Huber(Linear):
         sets, which = np.unique(np.array(inside), axis=0, return_inverse=True)
         total = np.zeros((len(member), len(self.epsilons)))
         for e, epsilon in enumerate(self.epsilons):
-            beta = self._settled(x, y_um, sets, np.full(len(sets), epsilon), scaled, free).beta
+            beta = self._minimised(x, y_um, sets, np.full(len(sets), epsilon), scaled, free).beta
             for f, rows, s in zip(outer, left, which, strict=True):
                 residual = y_um[rows] - x[rows] @ beta[s, :-1] - beta[s, -1]
                 total[f, e] += np.sqrt(residual @ residual / max(len(rows) - 1, 1))
@@ -98,7 +98,7 @@ class Huber(Linear):
 
 
 @dataclass(frozen=True)
-class Settled:
+class Minimum:
     """Coefficients (S, q), scale σ (S,), share of rows beyond ε σ (S,), steps taken (S,)."""
 
     beta: Array
@@ -107,7 +107,7 @@ class Settled:
     steps: NDArray[np.int64]
 
 
-def settle(x: Array, y: Array, member: Mask, epsilon: Array, penalty: Array, moves: Mask) -> Settled:
+def minimise(x: Array, y: Array, member: Mask, epsilon: Array, penalty: Array, moves: Mask) -> Minimum:
     """β and σ minimising `Σ (σ + σ H(r/σ)) + Σ_j penalty_j β_j²/σ` over the rows of each of S sets.
 
     x (n, q), y (n,), member (S, n), epsilon (S,), penalty and moves (S, q); inputs that do not move keep β = 0.
@@ -122,14 +122,14 @@ def settle(x: Array, y: Array, member: Mask, epsilon: Array, penalty: Array, mov
     """
     step = max(1, _AT_ONCE // max(1, len(y)))
     parts = [
-        _settle(x, y, member[i : i + step].astype(float), epsilon[i : i + step], penalty[i : i + step],
+        _minimise(x, y, member[i : i + step].astype(float), epsilon[i : i + step], penalty[i : i + step],
                 moves[i : i + step])
         for i in range(0, len(member), step)
     ]  # fmt: skip
-    return Settled(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Settled)))
+    return Minimum(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Minimum)))
 
 
-def _settle(x: Array, y: Array, member: Array, epsilon: Array, penalty: Array, moves: Mask) -> Settled:
+def _minimise(x: Array, y: Array, member: Array, epsilon: Array, penalty: Array, moves: Mask) -> Minimum:
     n = np.maximum(member.sum(axis=1), 1.0)
     least = np.maximum(_EXACT * np.sqrt(member @ y**2 / n), np.finfo(float).tiny)
     beta = _weighted(x, member, (member @ (x * y[:, None]))[:, :, None], penalty, moves)[:, :, 0]
@@ -156,13 +156,13 @@ def _settle(x: Array, y: Array, member: Array, epsilon: Array, penalty: Array, m
         scale[on] = np.maximum(scale[on], least[on])
         change = (beta[on] - held_beta[on]) @ x.T
         moved = np.sqrt(np.einsum("sn,sn,sn->s", inside, change, change) / n[on])
-        settled = moved + np.abs(scale[on] - held_scale[on]) <= _SETTLED * scale[on]
-        steps[on[settled]] = step + 1
-        todo = np.setdiff1d(todo, on[settled])
+        converged = moved + np.abs(scale[on] - held_scale[on]) <= _CONVERGED * scale[on]
+        steps[on[converged]] = step + 1
+        todo = np.setdiff1d(todo, on[converged])
         if not len(todo):
             break
     beta[todo], scale[todo] = held_beta[todo], held_scale[todo]
-    return Settled(beta, scale, far_share, steps)
+    return Minimum(beta, scale, far_share, steps)
 
 
 def _newton(

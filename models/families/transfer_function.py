@@ -50,7 +50,7 @@ class TransferFunction(Family):
 
     Two poles stand as the sum of their partial fractions, which contains the cascade K / ((τ1 s + 1)(τ2 s + 1)):
     K τ1 / (τ1 − τ2) and K τ2 / (τ2 − τ1). Inputs are the chosen sensors; their direct term is near a lead. With
-    `gaps` also how far each of them stands off the room at the start, as a step: castings that have not settled
+    `gaps` also how far each of them stands off the room at the start, as a step: castings that are not in steady state
     overnight relax like that; it takes two training batches per sensor. With `drivers` also (|n| / 1000 rpm)^m, m 1,
     1.5 or 2, other drivers and the ambient rise.
 
@@ -66,7 +66,7 @@ class TransferFunction(Family):
     """
 
     key = "transfer_function"
-    summary = "first-order responses to the sensors and to what is not settled at the start"
+    summary = "first-order responses to the sensors and to what is not steady at the start"
     source = "Ljung 1999, eq. 4.25; Golub and Pereyra 1973"
     closed_form = False
     has_sd = True

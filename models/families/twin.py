@@ -26,7 +26,7 @@ class Twin(Family):
 
     A calibration takes the training batches' sensors and errors (`channels`; empty: all that the twin has, so that the
     error channels of a machine share one calibration), one row in `every_s`. A prediction knows the drivers and the
-    surroundings alone: it starts where the network would settle with the surroundings' first values, plus the mean
+    surroundings alone: it starts in the steady state with the surroundings' first values, plus the mean
     deviation of the training batches' starts from that (`start` "usual"; "settled": without it), and runs free.
     `fitted`: the machine as JSON, the channels that drive it, parameters and their values, start_K by cell and its
     covariance over batches.

@@ -108,7 +108,7 @@ class TwinKalman(CorrectedTwin):
             stride = round(thin.step_s / design.batches[k].step_s) if thin.n_rows > 1 else 1
             rows = np.arange(design.offsets[k], design.offsets[k + 1], stride)
             usual_K = start_K if self.start == "usual" else 0.0
-            start_degC = start_of(work.network, values, inputs, settled=True) + usual_K
+            start_degC = start_of(work.network, values, inputs, steady=True) + usual_K
             (found,) = self._filters([thin], work.network, values, inputs, start_degC, [self.fitted["heat_W"]])
             y_um[rows] = left_um(design.y_um[rows], found.errors[0, : thin.n_rows, at])
         return y_um

@@ -8,7 +8,7 @@ import numpy as np
 
 from data.arrays import Array
 
-_INERTIA, _PULL = 0.7298, 1.49618  # constriction that settles: Clerc and Kennedy (2002), φ = 4.1
+_INERTIA, _PULL = 0.7298, 1.49618  # constriction that converges: Clerc and Kennedy (2002), φ = 4.1
 
 
 def least(

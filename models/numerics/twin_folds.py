@@ -36,7 +36,7 @@ SUBSTEPS_K = 0.03  # what the time step may cost; a third of a common sensor's l
 FAR = 16.0  # squared way, in posterior standard deviations, beyond which derivatives are taken anew
 NEAR = 0.1  # the same, beyond which derivatives are taken anew where a step brings less than they promise
 CLOSE = 1e-2  # expected gain in cost below which a fit has arrived: a step of a tenth of a posterior standard deviation
-SETTLED = 1e-2  # relative change of the channels' weights
+CONVERGED = 1e-2  # relative change of the channels' weights
 ROUNDS = 60
 _SHARES = (1.0, 0.5, 0.2, 0.05)
 _KEPT = 0.25  # of the gain that a step promises
@@ -47,7 +47,7 @@ _TOGETHER = 4
 
 @dataclass(frozen=True)
 class Calibrated:
-    """Calibration of one training set: parameter values (n,), and the starts relative to the settled state.
+    """Calibration of one training set: parameter values (n,), and the starts relative to the steady state.
 
     `start_K` (N,) is their mean deviation, shrunk towards 0 as by one batch that had none, `start_cov_K2` (N, N) the
     scatter of a batch's own about it. `left_out` gives, by training batch, the values and the start of the others.
@@ -141,7 +141,7 @@ class Calibrations:
     def left_out(self, train: Sequence[int], usual: bool) -> dict[int, tuple[Array, Array]]:
         """By training batch, errors (K, n_errors) and readings (K, n_sensors) that a twin without it predicts.
 
-        Free-running; with `usual`, from the others' mean deviation from the settled state. Only of what `of` has done.
+        Free-running; with `usual`, from the others' mean deviation from the steady state. Only of what `of` has done.
         """
         key = tuple(sorted(set(train)))
         with self._lock, threadpool_limits(limits=1):
@@ -149,7 +149,7 @@ class Calibrations:
                 out = {}
                 for k, (values, start_K) in self._done[key].left_out.items():
                     inputs = self._inputs.batch([self.used[k]])
-                    start = start_of(self.network, values, inputs, settled=True) + (start_K if usual else 0.0)
+                    start = start_of(self.network, values, inputs, steady=True) + (start_K if usual else 0.0)
                     done = simulate(self.network, values, inputs, start[None])
                     n = self.batches[k].n_rows
                     out[k] = done.errors[0, 0, :n], done.readings[0, 0, :n]
@@ -234,7 +234,7 @@ def _arrived(problem: CalibrationProblem, point: _Point) -> tuple[_Point, Noise,
         gain, cost = arrow.gain(dz), _cost(point.z, point.nuisance, residuals, blocks, noise)
         way = float(np.sum((arrow.root @ (point.z - point.taken_at)) ** 2))
         small = gain <= CLOSE
-        if small and noise.change(before) < SETTLED and way <= FAR:
+        if small and noise.change(before) < CONVERGED and way <= FAR:
             return replace(point, blocks=blocks), noise, f"arrived after {number} rounds"
         due = (way > FAR and (small or number % 3 == 0)) or (stalled and way > NEAR and not small)
         moved = None if due else _step(problem, point, arrow, dz, blocks, noise, cost)
@@ -298,11 +298,11 @@ def _without_each(problem: CalibrationProblem, point: _Point, noise: Noise) -> l
 
 
 def _own_starts_K(problem: CalibrationProblem, values: Array, nuisance: list[Array]) -> Array:
-    """How each batch's start (B, N) deviates from the settled state with its surroundings."""
+    """How each batch's start (B, N) deviates from the steady state with its surroundings."""
     bodies = len(problem.nuisances.start_K)
     own = np.array([v[:bodies] for v in nuisance]).reshape(len(nuisance), bodies)
     start = problem.start_degC + own @ problem.nuisances.start_K
-    return np.asarray(start - start_of(problem.network, values, problem.inputs, settled=True))
+    return np.asarray(start - start_of(problem.network, values, problem.inputs, steady=True))
 
 
 def _typical(network: Network, own_K: Array) -> tuple[Array, Array]:
@@ -347,9 +347,9 @@ class TwinRun:
         return TwinRun(self.network, tuple(self.batches[k] for k in numbers), used, inputs)
 
     def start_degC(self, values: Array, start_K: Array) -> Array:
-        """Start (…, used batches, N) of parameter sets (…, n_parameters): settled, and the usual deviation (…, N)."""
+        """Start (…, used batches, N) of parameter sets (…, n_parameters): steady, and the usual deviation (…, N)."""
         assert self.inputs is not None
-        return np.asarray(start_of(self.network, values, self.inputs, settled=True) + start_K[..., None, :])
+        return np.asarray(start_of(self.network, values, self.inputs, steady=True) + start_K[..., None, :])
 
     def by_batch(self, series: Array | None) -> list[Array]:
         """A series (used batches, K) as one array (n_k,) per batch, NaN for one that cannot be simulated."""
@@ -362,7 +362,7 @@ class TwinRun:
     def rows(self, values: Array, start_K: Array, error: int) -> tuple[Array, Array]:
         """One error (F, n) and the readings (F, n, sensors) at all rows, batch after batch, of F parameter sets.
 
-        values (F, n_parameters); start_K (F, N): by how much batches start above the state that settles with the first
+        values (F, n_parameters); start_K (F, N): by how much batches start above the steady state with the first
         values of their surroundings. NaN in a batch that cannot be simulated.
         """
         key = values.tobytes() + start_K.tobytes()

@@ -28,7 +28,8 @@ RUN_S = 6 * 3600.0
 # Scatter from batch to batch
 ROOM_DRIFT_K, ROOM_RIPPLE_K = (-1.0, 5.0), 0.3
 # Slow castings against the room: the machine never starts from equilibrium. Bell-shaped by a beta(a, a) law, narrower
-# for the column, which settles overnight sooner than bed and table; a is set so that models score as in print.
+# for the column, which reaches its steady state overnight sooner than bed and table; a is set so that models score as
+# in print.
 START_OFFSET_K = (-2.0, 4.0)
 START_OFFSET_SHAPE: Mapping[str, float] = MappingProxyType({"bed": 2.5, "column": 4.0, "table": 2.0})
 FRICTION_SCATTER = 0.15
@@ -187,12 +188,12 @@ def run_plans(plans: Sequence[Plan]) -> Truth:
 def sensor_degC(true_degC: Array, air_degC: Array, bonding: float) -> Array:
     """Reading of a surface sensor without its offset, along axis 0 at 10-s steps.
 
-    It sees ``T_a + eta (T_s - T_a)`` through a first-order lag of 60 s and starts settled.
+    It sees ``T_a + eta (T_s - T_a)`` through a first-order lag of 60 s and starts steady.
     """
     seen = air_degC + bonding * (true_degC - air_degC)
     keep = np.exp(-STEP_S / SENSOR_LAG_S)
-    settled = keep * seen[:1]
-    return np.asarray(lfilter([1 - keep], [1, -keep], seen, axis=0, zi=settled)[0])
+    steady = keep * seen[:1]
+    return np.asarray(lfilter([1 - keep], [1, -keep], seen, axis=0, zi=steady)[0])
 
 
 def write_sample_year(folder: Path, seed: int = 0, batches: int = 30) -> list[Path]:

@@ -128,7 +128,7 @@ def test_the_threshold_in_nats_grows_with_the_log_evidence() -> None:
 
 def test_alike_is_what_recordings_or_a_user_do_not_distinguish() -> None:
     assert alike(SINK, tried("radiation", "head", 10.0, cluster=SINK.cluster))
-    near = 0.9 * POLICY.settling_nats
+    near = 0.9 * POLICY.decisive_nats
     assert alike(SINK, tried("radiation", "bed", SINK.gain - near))
     assert not alike(SINK, tried("radiation", "bed", SINK.gain - 2.0 * near))
     assert not alike(SINK, tried("radiation", "head", SINK.gain - near))

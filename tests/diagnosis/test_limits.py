@@ -78,7 +78,7 @@ def test_noise_alone_gains_less_than_any_effect_that_is_claimed() -> None:
     bare = under(done, independent(done.problem, white_noise(done.problem)))
     for one in (done, bare):
         gains = np.array([s.gain for s in screen(one, proposed(one)).scored])
-        assert len(gains) > 20 and np.isfinite(gains).all() and gains.max() < POLICY.settling_nats
+        assert len(gains) > 20 and np.isfinite(gains).all() and gains.max() < POLICY.decisive_nats
 
 
 def test_it_is_what_reaches_the_threshold_and_a_margin() -> None:

@@ -26,7 +26,7 @@ from diagnosis.search.search import Search
 from tests.diagnosis.concealed import chain, empty
 from tests.twin.machines import machine
 from tests.twin.recordings import empty_batches, recorded
-from twin.calibration.least_squares import FitOptions, State, settled
+from twin.calibration.least_squares import FitOptions, State, converge
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.run_plan import RunPlan, load_run_plan
@@ -44,7 +44,7 @@ LOSS = {"exposures__shaft-room": {"value": "3 W/K", "spread": 0.7}}  # or more a
 
 def state_of(of: Machine, batches: Sequence[Batch], reweight: bool = True) -> tuple[CalibrationProblem, State]:
     problem = CalibrationProblem.of(compile_network(of), batches)
-    return problem, settled(problem, FitOptions(tolerance=1e-3, reweight=reweight))[0]
+    return problem, converge(problem, FitOptions(tolerance=1e-3, reweight=reweight))[0]
 
 
 def fitted(of: Machine, batches: Sequence[Batch]) -> Fitted:
@@ -101,7 +101,7 @@ def again(run: Run, hours: float, rpm: float) -> Run:
 def test_a_run_is_chosen_that_the_recordings_were_not() -> None:
     alternatives, chosen = tied(), proposal()
     assert chosen.separates == ("air", "loss") and chosen.tied == () and chosen.sensor is None
-    assert chosen.nats >= POLICY.settling_nats and chosen.nats_per_hour == pytest.approx(chosen.nats / chosen.hours)
+    assert chosen.nats >= POLICY.decisive_nats and chosen.nats_per_hour == pytest.approx(chosen.nats / chosen.hours)
     first = runs_of(alternatives["air"])[0]
     like_before = foreseen(list(alternatives.values()), [again(first, 4.0, 3000.0)]).nats[..., 0]
     by_words = chosen.table.set_index("run")["nats"]
@@ -111,9 +111,9 @@ def test_a_run_is_chosen_that_the_recordings_were_not() -> None:
     assert chosen.nats == pytest.approx(min(both[0, 1], both[1, 0])) and both[0, 1] > 2 * both[1, 0]
     assert list(chosen.table.columns) == list(COLUMNS) and by_words.is_monotonic_decreasing
     cool = next(w for w in by_words.index if w.startswith("a cool-down"))
-    assert by_words[cool] > POLICY.settling_nats
-    # several settle it: the shortest of them
-    assert chosen.hours == chosen.table.loc[chosen.table["nats"] >= POLICY.settling_nats, "hours"].min()
+    assert by_words[cool] > POLICY.decisive_nats
+    # several are decisive: the shortest of them
+    assert chosen.hours == chosen.table.loc[chosen.table["nats"] >= POLICY.decisive_nats, "hours"].min()
     assert chosen.sentence.startswith(f"{chosen.label.capitalize()} would distinguish air and loss: 4.0 h, ")
 
 
@@ -127,7 +127,7 @@ def test_the_run_carried_out_settles_it(tmp_path: Path, truth: str, other: str) 
     after = lead_nats(alternatives[truth], alternatives[other], [batch])
     run = next(r for r in runs_of(alternatives["air"]) if r.label == chosen.label)
     told = foreseen([alternatives[truth], alternatives[other]], [run]).nats[0, 1, 0]
-    assert after - before > POLICY.settling_nats
+    assert after - before > POLICY.decisive_nats
     # linear foresight: a parameter that must move far costs less or more than its first step says
     assert 0.5 * told < after - before < 1.5 * told
 
@@ -184,9 +184,11 @@ def test_one_more_sensor_where_no_run_tells_by_itself() -> None:
     beside = chain(mechanisms__hidden={**heat, "into": {"column": 0.5, "bed": "rest"}})
     shown = recorded(saddle, [replace(b, table=b.table.assign(coolant=0.0)) for b in empty(5)], seed=2)
     got = next_experiment({"saddle": fitted(saddle, shown), "beside": fitted(beside, shown)})
-    assert got.table["nats"].max() < POLICY.telling_nats and got.table["nats_with_sensor"].min() > POLICY.settling_nats
+    assert (
+        got.table["nats"].max() < POLICY.negligible_nats and got.table["nats_with_sensor"].min() > POLICY.decisive_nats
+    )
     assert got.sensor == "saddle" and set(got.table["sensor"]) == {"saddle"}
-    assert got.label.endswith(" with one more sensor at saddle") and got.nats > POLICY.settling_nats
+    assert got.label.endswith(" with one more sensor at saddle") and got.nats > POLICY.decisive_nats
     assert "# Put one more temperature sensor at saddle before.\n" in got.plan_text
 
 
@@ -227,7 +229,7 @@ def test_a_run_is_proposed_for_what_gains_too_little() -> None:
 
 def test_no_run_is_proposed_where_nothing_gains_or_all_is_claimed() -> None:
     assert revealing_run(unclaimed()) is None
-    assert revealing_run(unclaimed(POLICY.settling_nats - 0.1)) is None
+    assert revealing_run(unclaimed(POLICY.decisive_nats - 0.1)) is None
     assert revealing_run(unclaimed(20.0, accepted=True)) is None
 
 
@@ -274,7 +276,7 @@ def test_plans_read_back_as_they_are(tmp_path: Path, name: str, hours: float, st
             assert set(read) == set(meant)
             for n in meant:
                 np.testing.assert_allclose(read[n], meant[n], atol=1e-4)
-        assert (got.start, got.settled_degC) == (want.start, want.settled_degC)
+        assert (got.start, got.initial_degC) == (want.start, want.initial_degC)
         assert run.hours == pytest.approx(want.time_s[-1] / 3600.0)
         assert 3.0 <= run.hours <= 10.0 or name == "tclab_board"
 

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 from sklearn.linear_model import HuberRegressor
 
 from features.design import Design
-from models.families.huber import Huber, settle
+from models.families.huber import Huber, minimise
 from models.families.mlr import MLR
 from tests.toys.runs import stack
 
@@ -61,7 +61,7 @@ def test_the_criterion_has_its_minimum_there_ridge_included():
         beta, sigma = theta[:3], np.exp(theta[3])
         return criterion(x, y, beta, sigma, epsilon) + (penalty * beta**2).sum() / sigma
 
-    found = settle(x, y, np.ones((1, 80), bool), np.array([epsilon]), penalty[None], np.ones((1, 3), bool))
+    found = minimise(x, y, np.ones((1, 80), bool), np.array([epsilon]), penalty[None], np.ones((1, 3), bool))
     best = minimize(penalised, np.zeros(4), method="BFGS", options={"gtol": 1e-9})
     np.testing.assert_allclose(np.append(found.beta[0], np.log(found.scale[0])), best.x, rtol=0, atol=1e-6)
 
@@ -71,7 +71,7 @@ def test_few_rows_with_errors_of_any_size_end_at_the_minimum(seed):
     rng = np.random.default_rng(seed)
     x, y = rng.normal(size=(20, 3)), rng.standard_cauchy(20)
     epsilon, none, all_move = np.array([1.001]), np.zeros((1, 3)), np.ones((1, 3), bool)
-    found = settle(x, y, np.ones((1, 20), bool), epsilon, none, all_move)
+    found = minimise(x, y, np.ones((1, 20), bool), epsilon, none, all_move)
     size = np.full(4, 0.1 * found.scale[0])
     at = np.append(found.beta[0], found.scale[0])
     here = criterion(x, y, at[:3], at[3], 1.001)

@@ -329,7 +329,7 @@ def test_white_noise_is_not_inflated():
     found = fit(two_channel_problem([rng.normal(size=1500) for _ in range(4)]), FitOptions(reweight=True))
     assert np.all((found.inflation >= 0.95) & (found.inflation <= 1.1))
     assert np.all((found.noise_factor >= 1.0) & (found.noise_factor <= 1.05))
-    assert "; noise settled in round" in found.message
+    assert "; noise converged in round" in found.message
 
 
 def test_correlated_noise_widens_its_channel_alone():

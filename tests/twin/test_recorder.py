@@ -16,7 +16,7 @@ from tests.twin.machines import TWO_BODIES, machine
 from tests.twin.recordings import empty_batches, recorded
 from twin.calibration.least_squares import FitOptions
 from twin.calibration.problem import CalibrationProblem
-from twin.calibration.recorder import lead_remarks, settled_with_lead
+from twin.calibration.recorder import converge_with_lead, lead_remarks
 from twin.compile import compile_network
 from twin.simulation import simulate
 from twin.simulation.inputs import acting, inputs_of
@@ -54,7 +54,7 @@ def learned_rows(known: Machine, batches: tuple[Batch, ...]) -> float:
     def problem(lead_rows: float) -> CalibrationProblem:
         return CalibrationProblem.of(network, acting(batches, lead_rows))
 
-    return settled_with_lead(known, problem, FitOptions(tolerance=1e-2))[0]
+    return converge_with_lead(known, problem, FitOptions(tolerance=1e-2))[0]
 
 
 @pytest.mark.parametrize("rows", [0.0, 0.5, 1.0])

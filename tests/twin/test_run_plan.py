@@ -58,7 +58,7 @@ def test_stages_hold_and_a_driver_keeps_its_value(tmp_path: Path, machine: Machi
     assert np.array_equal(np.flatnonzero(coolant), np.arange(5, 185)) and not p.drivers["pos_x"].any()
     assert np.allclose(p.surroundings["room"], 20.0, atol=1e-12) and p.surroundings["room"].shape == (186,)
     assert np.allclose(p.surroundings["floor"], 17.0, atol=1e-12)
-    assert p.start_degC("bed") == p.settled_degC == pytest.approx(20.0)
+    assert p.start_degC("bed") == p.initial_degC == pytest.approx(20.0)
 
 
 def test_borders_stand_on_the_grid_and_the_regular_rows_are_told(tmp_path: Path, machine: Machine) -> None:
@@ -99,8 +99,8 @@ def test_start_of_bodies(tmp_path: Path, machine: Machine) -> None:
     assert p.start_degC("bed") == pytest.approx(18.0) and p.start_degC("column") == 20.0
     assert plan(tmp_path, machine, GOOD + "start: 21.5").start_degC("column") == 21.5
     no_room = "stages: [{hours: 1}]\n"
-    assert plan(tmp_path, machine, no_room + "start: 19 degC").settled_degC == 19.0
-    assert "start: bodies settle at the room's first value, and no surrounding is given; add" in fault(
+    assert plan(tmp_path, machine, no_room + "start: 19 degC").initial_degC == 19.0
+    assert "start: bodies are at the room's first value, and no surrounding is given; add" in fault(
         tmp_path, machine, no_room
     )
 
@@ -159,7 +159,7 @@ def test_a_table_holds_drivers_and_joins_surroundings(tmp_path: Path, machine: M
     assert p.drivers["spindle_rpm"].tolist() == [0, 0] + [4000] * 17  # the last row only ends the plan
     assert not p.drivers["coolant"].any()
     at = np.searchsorted(p.time_s, [0, 60, 120, 150])
-    assert p.surroundings["room"][at] == pytest.approx([20, 21, 22, 21.5]) and p.settled_degC == 20
+    assert p.surroundings["room"][at] == pytest.approx([20, 21, 22, 21.5]) and p.initial_degC == 20
 
 
 def test_a_recording_serves_as_a_plan(tmp_path: Path, machine: Machine) -> None:

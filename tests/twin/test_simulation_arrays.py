@@ -75,7 +75,7 @@ def test_the_start_follows_the_first_readings_and_settles_the_rest() -> None:
     inputs = drive(np.array([0.0, 60.0]), room=20.0, first=26.0)
     start = start_of(net, net.values, inputs)
     np.testing.assert_allclose(start, [[26.0, (12 * 26 + 8 * 20) / 20]], rtol=1e-5)
-    np.testing.assert_allclose(start_of(net, net.values, inputs, settled=True), [[20.0, 20.0]], atol=1e-6)
+    np.testing.assert_allclose(start_of(net, net.values, inputs, steady=True), [[20.0, 20.0]], atol=1e-6)
     blind = replace(inputs, first={"t_shaft": np.array([np.nan])})
     np.testing.assert_allclose(start_of(net, net.values, blind), [[20.0, 20.0]], atol=1e-9)
     assert start_of(net, net.values[None], inputs).shape == (1, 1, 2)

@@ -20,7 +20,7 @@ from twin.calibration.fit_problem import Unknown
 from twin.calibration.identifiability import Interval, Undetermined, correlation, intervals90, undetermined
 from twin.calibration.least_squares import Fit, FitOptions, fit
 from twin.calibration.problem import EVERY_S, CalibrationProblem
-from twin.calibration.recorder import first_lead_rows, lead_remarks, must_learn_lead, settled_with_lead
+from twin.calibration.recorder import converge_with_lead, first_lead_rows, lead_remarks, must_learn_lead
 from twin.calibration.whiteness import in_words, whiteness
 from twin.compile import compile_network
 from twin.network import Network
@@ -240,7 +240,7 @@ def calibrate(
     problem = problem_at(lead_rows)
     if must_learn_lead(machine, problem):
         rough = replace(options, starts=1, tolerance=max(options.tolerance, LEAD_TOLERANCE))
-        lead_rows, problem, *_ = settled_with_lead(machine, problem_at, rough, progress=report)
+        lead_rows, problem, *_ = converge_with_lead(machine, problem_at, rough, progress=report)
     done = fit(problem, options, report)
     if not (done.converged and np.isfinite(done.x).all() and np.isfinite(done.covariance).all()):
         raise WorkError(

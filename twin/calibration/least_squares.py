@@ -143,7 +143,7 @@ def _try(problem: Problem, state: State, dz: Array, share: float) -> tuple[State
 
 
 MISFIT, SMOOTH = 3.0, 5.0  # noise factor and rows that count as one: above both, a channel shows no noise but misfit
-SETTLED = 0.2  # change of a channel's weight in a round: 10 % of its sd, below what a few batches determine
+CONVERGED = 0.2  # change of a channel's weight in a round: 10 % of its sd, below what a few batches determine
 
 
 def noise_left(problem: Problem, state: State) -> Noise:
@@ -165,7 +165,7 @@ def annealed(
     progress: Callable[[str], None] | None = None,
     correlated: bool = True,
 ) -> State:
-    """From a state down until the noise settles, one step a round under the noise that is left.
+    """Descent from a state until the noise converges, one step a round under the noise that is left.
 
     With `correlated` False every row counts in full, however smooth the residuals are.
 
@@ -188,7 +188,7 @@ def annealed(
         change = noise.change(state.noise)
         if progress:
             progress(f"step {len(state.history)}: noise weights changed by up to {100 * change:.0f} %")
-        if change < SETTLED or state.stuck or not steps < len(state.history) < max_iterations:
+        if change < CONVERGED or state.stuck or not steps < len(state.history) < max_iterations:
             return state
 
 
@@ -254,7 +254,7 @@ class FitOptions:
     model expects the cost to fall by less than `tolerance` times max(1, cost per degree of freedom): x is within
     √tolerance posterior standard deviations of its optimum. With `reweight` each channel's noise and its correlation
     are estimated on the way down from the prior's mean (`annealed`) and then from the residuals of the best start until
-    they settle.
+    they converge.
     """
 
     starts: int = 1
@@ -274,11 +274,11 @@ def fit(problem: Problem, options: FitOptions = _DEFAULT, progress: Callable[[st
         InputError: no free parameter, or fewer usable rows than free parameters.
         WorkError: the model is not finite at the prior's mean.
     """
-    best, notes = settled(problem, options, progress)
+    best, notes = converge(problem, options, progress)
     return result(problem, best, options.tolerance, notes)
 
 
-def settled(
+def converge(
     problem: Problem,
     options: FitOptions = _DEFAULT,
     progress: Callable[[str], None] | None = None,
@@ -359,13 +359,13 @@ def _with_noise(
     for number in range(NOISE_ROUNDS):
         noise = noise_left(problem, state)
         change = noise.change(state.noise)
-        if change < SETTLED:
-            return state, f"; noise settled in round {number}"
+        if change < CONVERGED:
+            return state, f"; noise converged in round {number}"
         start = with_noise(problem, state, noise)
         state = descend(problem, start, len(start.history) + options.max_iterations, options.tolerance)
         if progress:
             progress(f"noise round {number + 1}: weights changed by up to {100 * change:.0f} %")
-    return state, f"; noise not settled: weights still change by {100 * change:.0f} % a round"
+    return state, f"; noise not converged: weights still change by {100 * change:.0f} % a round"
 
 
 def _starts_in_words(best: State, ends: Sequence[State], starts: int, lost: int) -> str:

@@ -12,18 +12,18 @@ import numpy as np
 
 from data.machine import LEAD_ROWS, Machine
 from twin.calibration.fit_problem import Noise
-from twin.calibration.least_squares import FitOptions, State, log_posterior, noise_left, settled
+from twin.calibration.least_squares import FitOptions, State, converge, log_posterior, noise_left
 from twin.calibration.problem import CalibrationProblem
 
 
-def settled_with_lead(
+def converge_with_lead(
     machine: Machine,
     problem_at: Callable[[float], CalibrationProblem],
     options: FitOptions,
     noise: Noise | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[float, CalibrationProblem, State, str]:
-    """`settled` for the problem whose drivers lead by as many rows as is likeliest, or as the machine file states.
+    """`converge` for the problem whose drivers lead by as many rows as is likeliest, or as the machine file states.
 
     Compared are the posteriors at each optimum with the noise of every channel unknown; rows count alike.
 
@@ -31,11 +31,11 @@ def settled_with_lead(
         problem_at: the problem whose drivers' changes come so many rows (0 to 1) before the row that shows them.
 
     Returns:
-        The lead in rows, its problem, and what `settled` returns for it.
+        The lead in rows, its problem, and what `converge` returns for it.
     """
     first_rows = first_lead_rows(machine)
     held = problem_at(first_rows)
-    state, notes = settled(held, options, progress, noise)
+    state, notes = converge(held, options, progress, noise)
     best = first_rows, held, state, notes
     if not must_learn_lead(machine, held):
         return best
@@ -43,7 +43,7 @@ def settled_with_lead(
     most = log_posterior(held, state, noise_held, noise_held.inflation)
     for lead_rows in sorted(LEAD_ROWS.values())[1:]:
         problem = problem_at(lead_rows)
-        state, notes = settled(problem, options, progress, noise)
+        state, notes = converge(problem, options, progress, noise)
         level = log_posterior(problem, state, noise_left(problem, state), noise_held.inflation)
         if level > most:
             best, most = (lead_rows, problem, state, notes), level

@@ -17,7 +17,7 @@ from twin.schema import MechanismPart, TwinPart
 
 
 class SensorLag(Mechanism):
-    """A sensor of one time constant, exact for what moves linearly between samples; settled at the first one.
+    """A sensor of one time constant, exact for what moves linearly between samples; steady at the first one.
 
     `view.step_s` is the spacing of the samples; where it is nan they stand at `view.time_s`, evenly or not.
     """
@@ -160,8 +160,8 @@ def _filtered(seen: Numeric, kept: Numeric, before: Numeric, now: Numeric) -> Nu
 def _of_one_lag(seen: Numeric, kept: complex, before: complex, now: complex) -> Numeric:
     from scipy.signal import lfilter  # takes long to load
 
-    settled = (kept + before) * seen[..., :1]
-    return np.asarray(lfilter([now, before], [1.0, -kept], seen, axis=-1, zi=settled)[0])
+    steady = (kept + before) * seen[..., :1]
+    return np.asarray(lfilter([now, before], [1.0, -kept], seen, axis=-1, zi=steady)[0])
 
 
 def _scanned(seen: Numeric, kept: Numeric, before: Numeric, now: Numeric) -> Numeric:

@@ -141,7 +141,7 @@ class RunPlan:
 
     `time_s` (n + 1,) rises from 0, not always evenly. `drivers` (n,) hold within each interval; every driver of the
     machine is there. `surroundings` (n + 1,), degC, stand at the borders and are linear between. `start` has the
-    bodies that the plan names, degC; every other body starts at `settled_degC`.
+    bodies that the plan names, degC; every other body starts at `initial_degC`.
     """
 
     name: str
@@ -149,7 +149,7 @@ class RunPlan:
     drivers: Mapping[str, Array]
     surroundings: Mapping[str, Array]
     start: Mapping[str, float]
-    settled_degC: float
+    initial_degC: float
     step_s: float = STEP_S
     source: str = ""
 
@@ -160,7 +160,7 @@ class RunPlan:
 
     def start_degC(self, body: str) -> float:
         """Start temperature of a body."""
-        return self.start.get(body, self.settled_degC)
+        return self.start.get(body, self.initial_degC)
 
 
 class _Plan(BaseModel):
@@ -215,10 +215,10 @@ def _from_yaml(path: Path, machine: Machine, where: str) -> RunPlan:
         for at in (f"{where}: surroundings.{n}",)
     }
     remedy = "add surroundings: {room: 20 degC}, or start: 20 degC"
-    start, settled_degC = _start(plan.start, surroundings, machine, where, remedy)
+    start, initial_degC = _start(plan.start, surroundings, machine, where, remedy)
     drivers = _on_grid(borders_s, held, time_s)
     name = plan.name or path.stem
-    return RunPlan(name, time_s, drivers, surroundings, start, settled_degC, step_s, path.name)
+    return RunPlan(name, time_s, drivers, surroundings, start, initial_degC, step_s, path.name)
 
 
 def _from_table(path: Path, machine: Machine, where: str) -> RunPlan:
@@ -247,9 +247,9 @@ def _from_table(path: Path, machine: Machine, where: str) -> RunPlan:
         at = f"{where}: column {n!r}"
         filled = fill_short_gaps(table.columns[n], table.time_s, max_gap_s, False, at)
         surroundings[n] = in_range(np.interp(time_s, table.time_s, filled), n, machine, at)
-    start, settled_degC = _start("settled", surroundings, machine, where, "add a column for it")
+    start, initial_degC = _start("settled", surroundings, machine, where, "add a column for it")
     drivers = _on_grid(borders_s, held, time_s)
-    return RunPlan(path.stem, time_s, drivers, surroundings, start, settled_degC, STEP_S, path.name)
+    return RunPlan(path.stem, time_s, drivers, surroundings, start, initial_degC, STEP_S, path.name)
 
 
 def _check_size(total_s: float, steps: float, step_s: float, where: str) -> None:
@@ -295,7 +295,7 @@ def _start(
     order = ["room", *machine.names("ambient"), *surroundings]
     room = next((n for n in order if n in surroundings), None)
     if room is None:
-        raise InputError(f"{at}: bodies settle at the room's first value, and no surrounding is given; {remedy}")
+        raise InputError(f"{at}: bodies are at the room's first value, and no surrounding is given; {remedy}")
     bodies = _twin_names(machine, "bodies")
     named: dict[str, float] = {}
     for body, value in given.items() if isinstance(given, Mapping) else ():

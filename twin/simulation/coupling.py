@@ -149,9 +149,9 @@ class _Solver:
             new = base + self._answer(response, heat_W)
             change = np.where(valid, np.abs(new - seen), 0.0).max(axis=(0, 1, 2))
             worst.append(float(change.max()))
-            settled = worst[-1] <= self.tolerance_K
-            seen[...] = new if settled else mixing(seen, new)
-            if settled or (not alone and k >= 6 and worst[-1] > 0.5 * worst[-4]):
+            converged = worst[-1] <= self.tolerance_K
+            seen[...] = new if converged else mixing(seen, new)
+            if converged or (not alone and k >= 6 and worst[-1] > 0.5 * worst[-4]):
                 break
             if k in (1, 4) and part.start == 0:  # one chord for all windows
                 fresh = self._chord(part)
@@ -272,6 +272,6 @@ class _Solver:
         check = f"check parameter {own[0]}" if own else f"check {name}"
         return (
             f"stiff beyond the step control: heat {name!r}, batch {inputs.batch_ids[b]}, at "
-            f"{inputs.time_s[b, at] / 3600.0:.2f} h, does not settle within one interval of "
+            f"{inputs.time_s[b, at] / 3600.0:.2f} h, does not converge within one interval of "
             f"{inputs.dt_s[b, at]:g} s; take smaller substeps, or {check}"
         )

@@ -315,7 +315,7 @@ def inputs_of_plan(network: Network, plan: RunPlan, clock_h: float = math.nan) -
             )
     cells = start_of_plan(network, plan)[0, 0]
     channels = {c for s in network.surroundings for c in s.first}
-    first = {c: np.full(1, plan.settled_degC) for c in channels}
+    first = {c: np.full(1, plan.initial_degC) for c in channels}
     first |= {r.channel: np.array([r.cells @ cells]) for r in network.readings}
     return Inputs(
         batch_ids=(plan.name,),
@@ -330,7 +330,7 @@ def inputs_of_plan(network: Network, plan: RunPlan, clock_h: float = math.nan) -
 
 def start_of_plan(network: Network, plan: RunPlan) -> Array:
     """Start temperatures of all cells (1, 1, N), degC, as the plan gives them by body."""
-    start = np.full((1, 1, network.n_cells), plan.settled_degC)
+    start = np.full((1, 1, network.n_cells), plan.initial_degC)
     for body, cells in network.bodies.items():
         start[..., cells] = plan.start_degC(body)
     return start

@@ -19,12 +19,12 @@ _LOOSE = 1e-9  # and the ambient what nothing else holds
 _LEAST_GAIN = 0.2  # of a sensor relative to its place; below, it carries no information
 
 
-def start_of(network: Network, values: Array, inputs: Inputs, settled: bool = False) -> Array:
+def start_of(network: Network, values: Array, inputs: Inputs, steady: bool = False) -> Array:
     """Start temperatures (P, B, N), degC, at parameter values (P, n); (B, N) at values (n,).
 
-    Cells with a sensor start at its first reading, the rest where the network at rest (every driver 0, no heat)
-    settles with those and the surroundings held. Without any first reading, or `settled`, there is only the second
-    part; a batch without first readings starts all at the ambient's first temperature.
+    Cells with a sensor start at its first reading, the rest at the steady state of the network at rest (every driver 0,
+    no heat) with those and the surroundings held. Without any first reading, or if `steady`, only the second part
+    applies; a batch without first readings starts all at the ambient's first temperature.
     """
     single, values = values.ndim == 1, np.atleast_2d(values)
     at_rest = np.ones((len(values), len(network.factors)))
@@ -40,7 +40,7 @@ def start_of(network: Network, values: Array, inputs: Inputs, settled: bool = Fa
     system = conductance + _LOOSE * scale * np.eye(network.n_cells)
     heat = heat + _LOOSE * scale[..., 0] * ambient[..., None]
     known = np.zeros(inputs.n_batches, bool)
-    for reading in network.readings if not settled else ():
+    for reading in network.readings if not steady else ():
         value = inputs.first.get(reading.channel, np.full(inputs.n_batches, np.nan))
         read = np.isfinite(value)
         known |= read
@@ -49,7 +49,7 @@ def start_of(network: Network, values: Array, inputs: Inputs, settled: bool = Fa
         place_degC = _beneath(reading, values, first, np.where(read, value, 0.0))
         heat = heat + hold[..., 0] * place_degC[..., None] * reading.cells
     out: Array = np.linalg.solve(np.broadcast_to(system, (*heat.shape, heat.shape[-1])), heat[..., None])[..., 0]
-    if not settled:
+    if not steady:
         out = np.where(known[:, None], out, ambient[..., None])
     return out[0] if single else out
 
@@ -60,7 +60,7 @@ def _beneath(reading: Reading, values: Array, air_degC: Array, shown_degC: Array
     low, high = np.zeros(shape), np.ones(shape)
     for law in reading.effects:
         if law.mechanism.along_time or any(p.cells is not None for p in law.ports.values()):
-            continue  # a lag has settled, and a swapped sensor reads another place
+            continue  # a lag is steady, and a swapped sensor reads another place
         view = View(degC={role: air_degC[:, :, p.surrounding, None] for role, p in law.ports.items()})
         low, high = (law.mechanism.reading(seen, view, parameters_of(law, values, 2)) for seen in (low, high))
     gain = (high - low)[..., 0]
@@ -90,7 +90,7 @@ def checked_start(network: Network, values: Array, inputs: Inputs, start: Array 
     """
     if start is None or (isinstance(start, str) and start == "settled"):
         own = inputs.with_own(inputs.times)  # the offsets act from the start on, not before
-        return start_of(network, values, own, settled=start is not None)
+        return start_of(network, values, own, steady=start is not None)
     if isinstance(start, str):
         raise InputError(f"machine {network.machine}: start is {start!r}, expected 'settled' or temperatures")
     given = np.asarray(start, float)
@@ -146,7 +146,7 @@ def steady_state(
     Newton steps with derivatives by the complex step, shortened where they would not help, to 1e-9 K.
 
     Raises:
-        InputError: a driver or surrounding of another name or without a value, or a state that does not settle.
+        InputError: a driver or surrounding of another name or without a value, or a steady state not reached.
     """
     values = network.values[None]
     air = _surroundings(network, surroundings_degC)
@@ -190,7 +190,7 @@ def steady_state(
             edges = np.array([float(network.edge_W_per_K(e, values, factor[None])[0]) for e in network.edges])
             return Steady(degC, air, np.real(watts(degC)), factor, edges)
     raise InputError(
-        f"machine {network.machine}: the steady state does not settle (still {np.abs(now).max():.2g} W off after "
+        f"machine {network.machine}: the steady state does not converge (still {np.abs(now).max():.2g} W off after "
         f"{_STEPS} steps); look for heat that grows with temperature"
     )
 

@@ -36,7 +36,7 @@ def machine(*recorded: str, **mechanisms: Any) -> Machine:
     )
 
 
-def settled_degC(network: Network, heat_W: dict[str, float], surroundings_degC: dict[str, float]) -> dict[str, float]:
+def initial_degC(network: Network, heat_W: dict[str, float], surroundings_degC: dict[str, float]) -> dict[str, float]:
     """Temperatures of the bodies at balance."""
     values = network.values
     air = np.array([surroundings_degC[s.name] for s in network.surroundings])
@@ -56,10 +56,10 @@ def test_enclosure_air_stands_between_the_surfaces_and_the_room() -> None:
     np.testing.assert_allclose(K, expected)
     np.testing.assert_allclose(network.surrounding_W_per_K(network.values), [[0, 0, 16, 70]])
     # all of 700 W given to the air leave by the wall or through the bed
-    T = settled_degC(network, {"air": 700.0}, {"room": 20.0})
+    T = initial_degC(network, {"air": 700.0}, {"room": 20.0})
     assert 70 * (T["air"] - 20) + 16 * (T["bed"] - 20) == pytest.approx(700.0)
     assert T["air"] > T["table"] > T["bed"] > 20
-    assert settled_degC(network, {}, {"room": 31.0}) == pytest.approx({b: 31.0 for b in network.cells})
+    assert initial_degC(network, {}, {"room": 31.0}) == pytest.approx({b: 31.0 for b in network.cells})
 
 
 def test_enclosure_air_keeps_names_values_and_priors() -> None:
