@@ -46,7 +46,7 @@ from diagnosis.diagnose import diagnose
 from diagnosis.fitting.batches import usable_batches
 from diagnosis.fitting.fitted import baseline
 from diagnosis.result import Diagnosis
-from diagnosis.search.claims import Round, alike
+from diagnosis.search.claims import Round, indistinguishable
 from diagnosis.search.search import one_round
 from thermodrift_exam.plants.plant import Case
 from thermodrift_exam.plants.real import recorded
@@ -63,7 +63,7 @@ from twin.schema import TwinPart, twin_part
 PAIRED: dict[Kind, int] = {"one": 10, "nothing": 7, "two": 3}  # cases of each kind
 SHARES: dict[Kind, float] = {"nothing": 0.4, "one": 0.45, "unlisted": 0.15}
 SHOWN = 10
-LEAST_GAIN = 1e-9  # relative: what gains less, or nothing, is alike
+LEAST_GAIN = 1e-9  # relative: smaller gains count as equal
 
 
 def examined(
@@ -225,14 +225,14 @@ def _round(r: Round, key: AnswerKey, bodies: Mapping[str, str]) -> dict[str, Any
     def right(c: Candidate) -> bool:
         return any(names_term(c.mechanism, Spot(c.where.kind, c.where.name), term, bodies) for term in key.terms)
 
-    same = [t for t in r.tried if r.best is not None and (t is r.best or alike(r.best, t))]
+    same = [t for t in r.tried if r.best is not None and (t is r.best or indistinguishable(r.best, t))]
     tried = [{"name": t.candidate.name, "gain": t.gain, "right": right(t.candidate)} for t in r.tried]
     screened = [
         {"name": s.candidate.name, "screen": k, "gain": s.gain, "absorbed": s.absorbed}
         for k, s in enumerate(r.screen.scored) if right(s.candidate)
     ]  # fmt: skip
     return {
-        "accepted": r.accepted, "trust": r.trust, "right": any(right(t.candidate) for t in same),
+        "accepted": r.accepted, "trust": r.claim_probability, "right": any(right(t.candidate) for t in same),
         "figures": asdict(r.figures) if r.figures else None, "evidence": r.before.log_evidence,
         "lead_rows": r.before.lead_rows, "hyper": asdict(r.before.hyper), "tried": tried,
         "screened": len(r.screen.scored), "true": screened[:SHOWN],
@@ -335,7 +335,7 @@ def claims(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def fitted_weights(table: pd.DataFrame) -> str:
-    """Offset and weight of the logarithm of the relative gain, and how well other kinds than a claim's foretell it."""
+    """Offset and weight of the logarithm of the relative gain, and how well other kinds than a claim's predict it."""
     x = np.log(np.maximum(table["relative_gain"].to_numpy(), LEAST_GAIN))[:, None]
     right, kind = (table["right"] == "yes").to_numpy(), table["kind"].to_numpy()
     probability = cross_val_predict(

@@ -255,9 +255,9 @@ class Fitted(Point):
         return self.level.log_evidence(self.grams, self.z)
 
     @cached_property
-    def foretold(self) -> Array:
+    def log_predictive_density(self) -> Array:
         """Log density (B,) of every batch, predicted from all others, in nats."""
-        return self.level.foretold(self.grams)
+        return self.level.log_predictive_density(self.grams)
 
     @cached_property
     def own(self) -> list[Array]:
@@ -320,7 +320,7 @@ class Tried:
         return int((self.by_run > 0).sum())
 
     @property
-    def standing(self) -> float:
+    def score(self) -> float:
         """Log weight among explanations; free forms imitate any law to within a share of its gain."""
         credit = POLICY.free_form_credit if self.candidate.kind.is_unlisted else 1.0
         return credit * self.gain + self.log_prior

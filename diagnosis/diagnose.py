@@ -43,13 +43,13 @@ from diagnosis.fitting.batches import enough_batches, usable_batches
 from diagnosis.fitting.fitted import (
     baseline,
     check,
+    degraded_channels,
     harms,
     lead_of,
     left_out_rows,
     on_all_rows,
     plain,
     rows_as_given,
-    worsened,
 )
 from diagnosis.localisation.balance import impossible
 from diagnosis.localisation.where_when import Located, locate
@@ -167,7 +167,7 @@ def _diagnosis(
     written = full if kept is final else kept and on_all_rows(kept, batches)
     worse = {}
     if written is not None and not drafted:
-        worse = worsened(rows_as_given(on_all_rows(done.baseline, batches)), left_out_rows(written))
+        worse = degraded_channels(rows_as_given(on_all_rows(done.baseline, batches)), left_out_rows(written))
     if worse:
         remarks += (f"the machine file keeps its values and parts: the fitted ones raise {made.rises(worse, units)}",)
     run, possible = deciding_run(named), []

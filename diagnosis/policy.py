@@ -1,6 +1,6 @@
 """Every threshold that changes a decision of the diagnosis, with its unit, its reason and its evidence.
 
-The fields stand in the order of the stages that read them; ``python -m diagnosis.policy`` prints them as the Markdown
+The fields are in the order of the stages that read them; ``python -m diagnosis.policy`` prints them as the Markdown
 tables of the documentation. The diagnosis reads `POLICY`; where an ablation changes a rule, a `Policy` is handed on.
 """
 
@@ -33,7 +33,9 @@ class Policy:
     min_block_rows: int = convention(24, "rows", "a shorter block shows no transient")
     min_usable_share: float = convention(0.5, "of the batches", "fewer would be other recordings than those given")
     min_rows_per_batch: int = convention(60, "rows, median batch", "a run of ten minutes counts as one of six hours")
-    initial_noise_factor: float = convention(3.0, "given noises", "all channels begin alike, so that none is neglected")
+    initial_noise_factor: float = convention(
+        3.0, "given noises", "the same for all channels, so that none is neglected"
+    )
     initial_rows_per_value: float = convention(20.0, "rows", "so many rows of a smooth misfit count as one")
     first_steps: int = cost(40, "steps", "bounds the descent from the values of the machine file")
     baseline_steps: int = cost(12, "steps", "under each covariance")
@@ -57,7 +59,7 @@ class Policy:
         (0.1, 1.0), "of the inner conductance", "each, from weak to as good as the chain"
     )
     stray_conductance: float = physical(
-        0.05, "of the weaker total", "bodies that almost touch, between bodies two apart"
+        0.05, "of the weaker total", "bodies that almost touch, between second neighbours"
     )
     leak_share: float = physical(0.15, "of a heat", "at most, into a neighbour of the body that it is drawn into")
     start_gradient_share: float = physical(0.1, "of the file's initial spread", "what a machine has done before")
@@ -66,8 +68,8 @@ class Policy:
     draw_max_size: float = analytic(4.0, "median draws", "a larger one would be the only direction")
     rough_memory: tuple[float, float] = convention((0.5, 0.9), "share; AR(1)", "before structure is learned")
     rough_structure_factor: float = convention(1.5, "of the draws", "before their scale is learned")
-    alone_shares: tuple[float, ...] = analytic(
-        (0.0, 0.3, 1.0, 4.0), "of a draw's own variance", "grid of the likelihood"
+    specific_shares: tuple[float, ...] = analytic(
+        (0.0, 0.3, 1.0, 4.0), "of a draw's specific variance", "grid of the likelihood"
     )
     structure_scales: tuple[float, ...] = analytic(
         (0.0, 0.06, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0), "of the draws", "grid of the likelihood"
@@ -82,12 +84,12 @@ class Policy:
     noise_min_rows: int = analytic(10, "rows", "fewer second differences show no noise")
     noise_kept_share: float = analytic(0.95, "of the rows", "the rest are jumps of a driver")
     noise_kept_factor: float = analytic(1.15, "factor", "what that share lacks of a normal distribution's rms")
-    rounded_min_share: float = convention(0.05, "of the rows", "that stand still: the channel is rounded")
+    rounded_min_share: float = convention(0.05, "of the rows", "that repeat: the channel is rounded")
     white_noise_bounds: tuple[float, float] = physical((0.5, 5.0), "given noises", "what a machine file may be off by")
     channel_rounds: int = cost(2, "rounds", "of noise that no refined twin shows")
     channel_min_excess: float = analytic(1.1, "sd", "less is chance")
     fit_steps: int = cost(6, "steps", "of a refit; most end after three")
-    fit_tolerance_nats: float = analytic(0.1, "nats", "a smaller fall of the cost changes no decision")
+    fit_tolerance_nats: float = analytic(0.1, "nats", "a smaller drop of the cost changes no decision")
     damping_tries: int = cost(7, "steps", "shorter each time, before a fit ends")
     damping_start: float = convention(1e-3, "of the curvature", "of the first shorter step")
     damping_factor: float = convention(6.0, "factor", "from one shorter step to the next")
@@ -137,7 +139,7 @@ class Policy:
         "of what a claim needs",
         "of 76 refits with a quarter of that, 72 were promised this; no other was right",
     )
-    unlisted_term_cost_nats: float = analytic(1.0, "nats", "of what gains alike a listed law comes first")
+    unlisted_term_cost_nats: float = analytic(1.0, "nats", "of equal gains a listed law comes first")
     run_windows: int = cost(12, "parts of a run", "in which what happens once is looked for")
     form_places: int = cost(4, "places", "at which products and squares of drivers are looked for")
     free_form_credit: float = development(0.9, "of its gain", "free forms imitate any law to within a tenth")
@@ -174,7 +176,7 @@ class Policy:
     )
     max_probability: float = convention(0.99, "probability", "of more runs: no set of candidates is complete")
     unlisted_odds: float = development(50.0, "odds", "of the best explanation against what is not listed")
-    alike_min_probability_share: float = convention(0.25, "of the likeliest", "an explanation as probable is alike")
+    tied_min_probability_share: float = convention(0.25, "of the likeliest", "an explanation as probable is tied")
     reported_min_probability: float = convention(0.005, "probability", "a less likely alternative is not reported")
     named_min_probability_share: float = convention(0.1, "of the finding", "a less likely one does not count as named")
     reported_alternatives: int = convention(5, "alternatives", "in the findings")
@@ -211,7 +213,7 @@ class Policy:
     )
     rest_before_run_h: float = physical(24.0, "h", "a machine tool is at rest then")
     warm_up_h: float = physical(4.0, "h", "before a cool-down")
-    night_fall_K: float = physical(6.0, "K", "a hall over a night")
+    night_drop_K: float = physical(6.0, "K", "a hall over a night")
     hall_heating_K: float = physical(5.0, "K", "a hall that is heated in the morning")
     morning_h: float = convention(7.0, "h, time of day", "a shop begins its runs")
     evening_h: float = convention(21.0, "h, time of day", "a night begins")
@@ -249,18 +251,18 @@ class Policy:
     draft_heat_outlets: int = convention(2, "bodies", "that a heat goes into")
     draft_min_outlet_share: float = convention(0.02, "of a heat", "into a body")
     draft_chain_bodies: tuple[int, int] = convention((2, 4), "bodies", "of an error chain, at least and at most")
-    draft_chain_min_fall: float = convention(0.05, "of the error's rms", "for one body more")
+    draft_chain_min_drop: float = convention(0.05, "of the error's rms", "for one body more")
     draft_held_capacity_J_per_K: float = physical(10e3, "J/K", "held where nothing heats")
     draft_gain_sd_um_per_K: float = physical(10.0, "um/K", "prior of an error chain's gain")
     draft_start_sd_K: float = physical(0.5, "K", "of a body's start")
     draft_offset_sd_K: float = physical(0.5, "K", "of a sensor, beyond what first readings say")
     draft_folds: int = cost(4, "folds", "parts that are left out in turn")
-    draft_misfit_share: float = development(0.1, "of the movement", "what a drafted network leaves; weights the rows")
+    draft_misfit_share: float = development(0.1, "of the movement", "residual of a drafted network; weights the rows")
     draft_rows_per_value: float = development(10.0, "rows", "so many rows of a smooth misfit count as one")
     draft_steps: int = cost(30, "steps", "of the fit to all parts")
     draft_fold_steps: int = cost(10, "steps", "of the fit without a fold")
-    draft_tolerance: float = analytic(1e-3, "nats per row", "a smaller fall of the cost changes no decision")
-    draft_min_fall: float = convention(0.03, "of what is left", "for a body or a set of links more")
+    draft_tolerance: float = analytic(1e-3, "nats per row", "a smaller drop of the cost changes no decision")
+    draft_min_drop: float = convention(0.03, "of what is left", "for a body or a set of links more")
     draft_patience: int = cost(2, "counts of bodies", "without improvement, after which the search ends")
     draft_max_bodies: int = cost(8, "bodies", "of a drafted network")
 
@@ -270,7 +272,7 @@ class Policy:
     active_min_level: float = convention(
         0.5, "of a law's own activity", "a law that states its activity works above it"
     )
-    structure_error_share: float = development(0.025, "of the movement", "what a network of castings usually leaves")
+    structure_error_share: float = development(0.025, "of the movement", "usual residual of a network of castings")
     residual_max_units: float = development(
         6.0, "structural errors", "267 complete cases left 1.5 in the median, 5.1 at most"
     )
@@ -284,7 +286,7 @@ class Policy:
     untied_probability: float = convention(0.9, "probability", "above it no alternative is tied")
     plain_probability: float = convention(0.9, "probability", "above it a claim is stated plainly")
     likely_probability: float = convention(0.6, "probability", "above it a claim is most likely, below it perhaps")
-    fallen_max_share: float = convention(0.98, "of the error before", "an error that keeps more has not fallen")
+    reduced_max_share: float = convention(0.98, "of the error before", "an error that keeps more is not reduced")
     noise_max_ratio: float = convention(1.5, "times the given noise", "a channel up to it is noise")
     limit_power_sd: float = analytic(1.64, "sd", "an effect at its limit is seen in 95 of 100 such sets of runs")
     limit_absorbed_share: float = convention(0.3, "of a signature", "from it on the hiding parameter is named")

@@ -91,8 +91,8 @@ class Form:
             return
         yield f"with the square of {one.label}" if self.role in ("square", "square_cross") else one.following
         if other is not None:
-            alike = one.switched == other.switched and self.role == "cross"
-            yield f"{'and ' if alike else ''}{other.following}"
+            same = one.switched == other.switched and self.role == "cross"
+            yield f"{'and ' if same else ''}{other.following}"
 
     @property
     def top(self) -> float:

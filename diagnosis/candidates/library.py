@@ -340,8 +340,8 @@ def _there_already(part: TwinPart, c: Candidate) -> bool:
         if either_way and set(ends.values()) == set(own.values()):
             return True
         if c.part.into is not None:
-            alike = all(own[port] == ends.get(port, own[port]) for port in own if port in _exchanging(c))
-            if alike and c.part.into in outlets_of(given):
+            same = all(own[port] == ends.get(port, own[port]) for port in own if port in _exchanging(c))
+            if same and c.part.into in outlets_of(given):
                 return True
         elif (set(several(c.part.acts_on)) <= set(several(given.acts_on)) and (not ends or ends == own)) or (
             c.part.acts_on is None and ends == own

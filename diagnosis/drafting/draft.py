@@ -1,6 +1,6 @@
 """The simplest network that recordings support, for a machine file without a twin part.
 
-Sensors that move alike share a body; the bodies form a tree of conductances in a room; every driver is a heat. How
+Sensors that move together share a body; the bodies form a tree of conductances in a room; every driver is a heat. How
 many bodies there are is what predicts parts of the recordings that were left out, by the one-standard-error rule
 (Breiman, Friedman, Olshen and Stone 1984, Classification and Regression Trees, section 3.4.3).
 """
@@ -194,7 +194,7 @@ def _tried_in_turn(tried: Callable[[int], _Tried], most: int) -> list[_Tried]:
         one = _or_none(lambda count=count: tried(count))  # type: ignore[misc]
         if one is not None and len(one.sketch.groups) == count:
             every.append(one)
-        if one is not None and one.scored.share_left < (1 - POLICY.draft_min_fall) * best:
+        if one is not None and one.scored.share_left < (1 - POLICY.draft_min_drop) * best:
             best, failed = one.scored.share_left, 0
         else:
             failed += 1
@@ -214,7 +214,7 @@ def _or_none(work: Callable[[], _Tried]) -> _Tried | None:
 def _as_good(one: Scored, best: Scored) -> bool:
     """Whether the other is not better by more than its standard error and the least gain."""
     gain, error = best.better_than(one)
-    return gain <= max(error, -np.log(1 - POLICY.draft_min_fall))
+    return gain <= max(error, -np.log(1 - POLICY.draft_min_drop))
 
 
 def _words(rows: Rows, chosen: _Tried, heats: Sequence[Driven]) -> tuple[str, ...]:

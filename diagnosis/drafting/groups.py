@@ -1,4 +1,4 @@
-"""Temperatures that move alike: which sensors one body can stand for, and what that body does."""
+"""Temperatures that move together: which sensors one body can stand for, and what that body does."""
 
 from __future__ import annotations
 
@@ -254,9 +254,9 @@ class Rises:
         """How far two sensors are from reading one body, (S, S): rms difference of their rises over their size."""
         small = POLICY.draft_small_rise_share * float(np.median(self.size_K))
         scale = np.sqrt(np.outer(self.size_K, self.size_K) + small**2 + np.outer(self.noise_K, self.noise_K))
-        apart = np.sqrt(_mean((self.rise_K[:, :, None] - self.rise_K[:, None, :]) ** 2)) / scale
-        never_together = 2.0 * float(np.nanmax(apart, initial=1.0))
-        return np.where(np.isfinite(apart), apart, never_together)
+        distance = np.sqrt(_mean((self.rise_K[:, :, None] - self.rise_K[:, None, :]) ** 2)) / scale
+        never_together = 2.0 * float(np.nanmax(distance, initial=1.0))
+        return np.where(np.isfinite(distance), distance, never_together)
 
     def clusters(self, count: int) -> list[list[int]]:
         """At most `count` groups of sensors, each a part of one group of the next smaller count; by sensors' order."""
@@ -274,10 +274,10 @@ class Rises:
     def offsets_K(self, group: Sequence[int]) -> Array:
         """By how much each sensor of a group starts above the group's mean, median over parts; 0 of too few."""
         first = self.first_degC[:, group]
-        apart = first - _mean(first, axis=1)[:, None]
+        difference = first - _mean(first, axis=1)[:, None]
         if len(first) < POLICY.draft_min_offset_batches:
             return np.zeros(len(group))
-        return np.nan_to_num(_median(apart))
+        return np.nan_to_num(_median(difference))
 
     def body_degC(self, group: Sequence[int]) -> Array:
         """The group's mean temperature (n,), sensors without a value left out; NaN where none has one."""

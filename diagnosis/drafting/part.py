@@ -38,10 +38,10 @@ class Sketch:
 def sketch(rows: Rows, rises: Rises, heats: Sequence[Driven], count: int, extra_links: bool = False) -> Sketch:
     """The network of at most `count` bodies that the recordings suggest: a tree, or with every body's second link."""
     groups = rises.clusters(count)
-    apart = between(rises.distance, groups)
-    links = tree_of(apart)
+    distance = between(rises.distance, groups)
+    links = tree_of(distance)
     if extra_links:
-        links = sorted({*links, *_second(apart, links)})
+        links = sorted({*links, *_second(distance, links)})
     body = np.column_stack([rises.body_degC(g) for g in groups])
     room = _room(rows, rises)
     level = {h.driver: np.concatenate([b.values(h.driver) for b in rows.batches]) for h in heats}
@@ -108,13 +108,13 @@ def _free(value: float, unit: str) -> dict[str, Any]:
     return {"value": f"{value:.3g} {unit}", "spread": POLICY.draft_log_sd}
 
 
-def _second(apart: Array, links: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+def _second(distance: Array, links: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     """For every body the nearest that it is not linked with."""
     out = []
-    for k in range(len(apart)):
-        rest = [j for j in range(len(apart)) if j != k and (min(j, k), max(j, k)) not in links]
+    for k in range(len(distance)):
+        rest = [j for j in range(len(distance)) if j != k and (min(j, k), max(j, k)) not in links]
         if rest:
-            j = min(rest, key=lambda j: apart[k, j])
+            j = min(rest, key=lambda j: distance[k, j])
             out.append((min(j, k), max(j, k)))
     return out
 
@@ -216,7 +216,7 @@ def _chain(channel: str, rows: Rows, rises: Rises, body_degC: Array) -> tuple[in
         rest = [k for k in range(rise_K.shape[1]) if k not in chosen]
         tried = {k: _left(rise_K[:, [*chosen, k]], error) for k in rest}
         best = min(rest, key=lambda k: tried[k])
-        if len(chosen) >= POLICY.draft_chain_bodies[0] and tried[best] > (1 - POLICY.draft_chain_min_fall) * left:
+        if len(chosen) >= POLICY.draft_chain_bodies[0] and tried[best] > (1 - POLICY.draft_chain_min_drop) * left:
             break
         chosen.append(best)
         left = tried[best]

@@ -201,7 +201,7 @@ def claimed(done: Round, part: TwinPart, final: Fitted) -> Found:
     every, _, _ = explanations(done)
     best = next(e for e in every if e.tried is done.best)
     c = best.tried.candidate
-    own = [e for e in every if e is best or e.alike]
+    own = [e for e in every if e is best or e.indistinguishable]
     same = [e for e in own if (e.tried.candidate.mechanism, e.tried.candidate.where) == (c.mechanism, c.where)]
     rest = [e for e in every if e not in same]
     return Found(
@@ -225,7 +225,7 @@ def _place_of(c: Candidate, part: TwinPart) -> str:
 def _other(e: Explanation, part: TwinPart) -> Other:
     c = e.tried.candidate
     context = context_label(c.part, c.where, part) if c.part is not None else ""
-    return Other(c.mechanism, c.where, _place_of(c, part), e.probability, context, e.alike)
+    return Other(c.mechanism, c.where, _place_of(c, part), e.probability, context, e.indistinguishable)
 
 
 def reported_parameters(

@@ -122,14 +122,14 @@ class Rms:
 
 @dataclass(frozen=True)
 class Other:
-    """Another explanation; `alike`: these runs cannot distinguish it from the one found."""
+    """Another explanation, and whether these runs cannot distinguish it from the effect."""
 
     mechanism: str
     where: Where
     place: str
     probability: float
     context: str = ""
-    alike: bool = True
+    indistinguishable: bool = True
 
 
 @dataclass(frozen=True)
@@ -177,17 +177,17 @@ class Found:
         return tuple(p for p in own if p in fitted) or own[:1] or tuple(fitted[:1]) or tuple(self.parameters)[:1]
 
     @property
-    def alone(self) -> float:
-        """Its probability without those of the explanations that are alike."""
-        return max(0.0, self.probability - sum(o.probability for o in self.others if o.alike))
+    def separate_probability(self) -> float:
+        """Its probability without those of the explanations that are indistinguishable from it."""
+        return max(0.0, self.probability - sum(o.probability for o in self.others if o.indistinguishable))
 
     @property
     def tied(self) -> tuple[Other, ...]:
         """Explanations that these runs cannot distinguish from it and that are nearly as probable."""
-        if self.alone > POLICY.untied_probability:
+        if self.separate_probability > POLICY.untied_probability:
             return ()
-        least = POLICY.alike_min_probability_share * self.alone
-        return tuple(o for o in self.others if o.alike and o.probability >= least)
+        least = POLICY.tied_min_probability_share * self.separate_probability
+        return tuple(o for o in self.others if o.indistinguishable and o.probability >= least)
 
 
 def beyond_noise(rms: Sequence[Rms]) -> list[Rms]:
@@ -340,7 +340,7 @@ def _amplitude(amplitudes: Mapping[str, float], mechanism: str) -> tuple[float, 
 
 def steps_table(rounds: Sequence[Round]) -> pd.DataFrame:
     rows = [
-        (k + 1, r.best.candidate.label, r.best.gain, r.threshold, r.trust, r.best.improved, r.accepted)
+        (k + 1, r.best.candidate.label, r.best.gain, r.threshold, r.claim_probability, r.best.improved, r.accepted)
         for k, r in enumerate(rounds)
         if r.best is not None
     ]

@@ -80,7 +80,9 @@ def finding_of(found: Found) -> Finding:
         },
         probability=found.probability,
         alternatives=tuple(
-            Alternative(mechanism=o.mechanism, where=_place(o.where), probability=o.probability, alike=o.alike)
+            Alternative(
+                mechanism=o.mechanism, where=_place(o.where), probability=o.probability, alike=o.indistinguishable
+            )
             for o in found.others
         ),
         equation=equation_with_numbers(MECHANISMS[found.mechanism], values) if found.mechanism in MECHANISMS else "",
@@ -111,8 +113,11 @@ def statement(found: Found) -> str:
 def claim_phrase(found: Found) -> str:
     """What is missing, where and how much, without a full stop; the first letter is a capital."""
     if found.tied:
-        # what is claimed may be the less likely: a likelier one that looks alike may fail a criterion
-        own = (found.alone, f"{effect_phrase(found)}{_size(found)} ({percent(found.alone)})")
+        # what is claimed may be the less likely: a likelier, indistinguishable one may fail a criterion
+        own = (
+            found.separate_probability,
+            f"{effect_phrase(found)}{_size(found)} ({percent(found.separate_probability)})",
+        )
         tied = [(o.probability, f"{_other_phrase(o)} ({percent(o.probability)})") for o in found.tied]
         said = [text for _, text in sorted([own, *tied], key=lambda s: -s[0])]
         numbers = {2: "two", 3: "three", 4: "four"}
@@ -140,9 +145,9 @@ def falls(rms: Sequence[Rms], most: int = 2) -> str:
     """How far the errors of the runs left out fall, the greatest fall first, and which ones rise; nothing where none
     falls."""
     rms = [r for r in rms if few(r.before) != few(r.after)]
-    fallen = [r for r in rms if r.after < POLICY.fallen_max_share * r.before]
+    fallen = [r for r in rms if r.after < POLICY.reduced_max_share * r.before]
     fallen = sorted(fallen, key=lambda r: (r.after / r.before, r.channel))[:most]
-    risen = [r for r in rms if r.before < POLICY.fallen_max_share * r.after and not r.after <= r.noise]
+    risen = [r for r in rms if r.before < POLICY.reduced_max_share * r.after and not r.after <= r.noise]
     risen = sorted(risen, key=lambda r: (-r.after / r.before, r.channel))[:most]
     said = []
     for k, r in enumerate(fallen):
@@ -303,10 +308,10 @@ def _replaced(path: str, was: float | None, now: Estimate) -> str:
 
 def _others(found: Found) -> list[str]:
     """What would look the same, and the run that would distinguish them; what is less likely is not named."""
-    alike = [o for o in found.others if o.alike and o not in found.tied][:_MAX_NAMED]
-    if not alike:
+    same = [o for o in found.others if o.indistinguishable and o not in found.tied][:_MAX_NAMED]
+    if not same:
         return [f"{_capital(found.separates)} would distinguish them."] if found.tied and found.separates else []
-    said = listed([f"{_other_phrase(o)} ({percent(o.probability)})" for o in alike])
+    said = listed([f"{_other_phrase(o)} ({percent(o.probability)})" for o in same])
     run = f"; {found.separates} would distinguish them" if found.separates else ""
     return [f"{_capital(said)} would look the same in these runs{run}."]
 

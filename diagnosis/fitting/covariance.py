@@ -1,6 +1,6 @@
-"""The covariance of what a calibrated network leaves: noise, structure of refined twins, and known imperfections.
+"""The covariance of the residuals of a calibrated network: noise, structure of refined twins, known imperfections.
 
-``Σ = blocks + D Dᵀ``: a block per batch and channel of white noise and of what refined twins show that no other does,
+``Σ = blocks + D Dᵀ``: a block per batch and channel of white noise and of the specific components of refined twins,
 and directions D (n, K), of sd 1 each, that all batches share: structure is the same in every run. Directions are
 unknowns of prior N(0, 1) like parameters, so that effects are judged with all of them integrated out.
 """
@@ -35,8 +35,8 @@ def slices_of(channel: NDArray[np.int64]) -> Slices:
 class Structure:
     """What covariances are learned from, in units of the given noise.
 
-    Of every batch `drawn` (n_b, T), what refined twins show beyond a recalibration, and `known` (n_b, K), imperfections
-    of any machine per sd; `noise` (C,) is each channel's white noise.
+    Of every batch `drawn` (n_b, T), draws of refined twins, orthogonal to the parameters, and `known` (n_b, K),
+    imperfections of any machine per sd; `noise` (C,) is each channel's white noise.
     """
 
     drawn: Sequence[Array]
@@ -44,9 +44,9 @@ class Structure:
     noise: Array
 
     @cached_property
-    def alone(self) -> list[Array]:
-        """What each draw shows that no other does (n_b, T)."""
-        return alone_in(self.drawn)
+    def specific(self) -> list[Array]:
+        """The specific component of each draw, (n_b, T) of every batch."""
+        return specific_component(self.drawn)
 
     @property
     def directions(self) -> tuple[Array, ...]:
@@ -68,7 +68,7 @@ class Covariance:
     factor: Array
     drawn: int = 0  # how many of the directions, the first ones, were drawn; the others are imperfections
     structure: Structure | None = None
-    share: float = 0.0  # of what draws alone show
+    share: float = 0.0  # of the variance of specific components
 
     @classmethod
     def of(cls, problem: CalibrationProblem, block: Callable[[int, int, slice], Array], **given: Any) -> Covariance:
@@ -130,12 +130,12 @@ def rough(problem: CalibrationProblem, directions: Sequence[Array]) -> Covarianc
 
 
 def learned(problem: CalibrationProblem, structure: Structure, share: float) -> Covariance:
-    """White noise and, times `share`, the variance of what each draw alone shows; all directions of sd 1."""
+    """White noise and, times `share`, the variance of the draws' specific components; all directions of sd 1."""
 
     def block(b: int, c: int, at: slice) -> Array:
-        alone = structure.alone[b][at]
-        white = structure.noise[c] ** 2 * np.eye(len(alone))
-        return np.asarray(white + share / alone.shape[1] * alone @ alone.T, float)
+        specific = structure.specific[b][at]
+        white = structure.noise[c] ** 2 * np.eye(len(specific))
+        return np.asarray(white + share / specific.shape[1] * specific @ specific.T, float)
 
     drawn = structure.drawn[0].shape[1]
     directions = structure.directions
@@ -145,16 +145,16 @@ def learned(problem: CalibrationProblem, structure: Structure, share: float) -> 
 def white_noise(problem: CalibrationProblem) -> Array:
     """The sd (C,) of each channel's white noise in units of the given one, from second differences.
 
-    A channel that stands still from row to row is rounded: it has at least the given noise.
+    A channel whose value repeats from row to row is rounded: it has at least the given noise.
     """
     out = np.ones(len(problem.channels))
     for c in range(len(out)):
-        apart = []
+        differences = []
         for m in problem.measured:
             at = m.channel == c
             even = np.diff(m.row[at], 2) == 0
-            apart.append(np.diff(m.value[at], 2)[even] / (np.sqrt(6.0) * problem.noise[c]))
-        second = np.abs(np.concatenate(apart)) if apart else np.zeros(0)
+            differences.append(np.diff(m.value[at], 2)[even] / (np.sqrt(6.0) * problem.noise[c]))
+        second = np.abs(np.concatenate(differences)) if differences else np.zeros(0)
         if len(second) < POLICY.noise_min_rows:
             continue
         kept = np.sort(second)[: int(POLICY.noise_kept_share * len(second))]
@@ -165,8 +165,14 @@ def white_noise(problem: CalibrationProblem) -> Array:
     return out
 
 
-def beyond_recalibration(blocks: Sequence[Block], spread: Array, drawn: Sequence[Array]) -> list[Array]:
-    """Signatures (n_b, K) less what one linear step of parameters and own unknowns, within their priors, takes."""
+def orthogonal_to_parameters(blocks: Sequence[Block], spread: Array, drawn: Sequence[Array]) -> list[Array]:
+    """Signatures (n_b, K) less what one linear step of the parameters and nuisances, within their priors, explains.
+
+    Args:
+        blocks: of every batch, the problem linearised at a point.
+        spread: prior sd (p,) of the parameters.
+        drawn: signatures (n_b, K) of every batch, in units of the given noise.
+    """
     size = len(spread)
     information, shared, own = np.eye(size), np.zeros((size, drawn[0].shape[1])), []
     for b, d in zip(blocks, drawn, strict=True):
@@ -184,15 +190,15 @@ def beyond_recalibration(blocks: Sequence[Block], spread: Array, drawn: Sequence
 
 
 def clipped(drawn: Sequence[Array]) -> list[Array]:
-    """Draws (n_b, K) of which none is much larger than the median one."""
+    """Draws (n_b, K), none much larger than the median one."""
     size = np.sqrt(sum(np.einsum("nk,nk->k", d, d) for d in drawn))
     most = POLICY.draw_max_size * float(np.median(size))
     factor = np.minimum(1.0, most / np.maximum(size, 1e-300))
     return [d * factor for d in drawn]
 
 
-def alone_in(drawn: Sequence[Array]) -> list[Array]:
-    """What each of the draws (n_b, K) shows that no combination of the others does (ridge 1)."""
+def specific_component(drawn: Sequence[Array]) -> list[Array]:
+    """The part of each draw (n_b, K) that no linear combination of the others has (ridge 1)."""
     gram = sum(d.T @ d for d in drawn)
     inverse = np.linalg.inv(np.asarray(gram) + np.eye(len(np.asarray(gram))))
     rest = inverse / np.diag(inverse)

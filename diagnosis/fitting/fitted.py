@@ -21,10 +21,10 @@ from diagnosis.fitting.carried import carried_nuisances, carried_start, carried_
 from diagnosis.fitting.covariance import (
     Covariance,
     Structure,
-    beyond_recalibration,
     clipped,
     independent,
     learned,
+    orthogonal_to_parameters,
     rough,
     white_noise,
 )
@@ -111,16 +111,16 @@ def _calibrated_first(
 ) -> Point:
     """Where a fit from the values of the machine file on ends, the lead learned unless it is given."""
     network, every_s = compile_network(machine, part=part), spacing_s(batches)
-    options, alike = _first_calibration(len(network.readings) + len(network.errors))
+    options, noise = _first_calibration(len(network.readings) + len(network.errors))
 
     def problem_at(lead: float) -> CalibrationProblem:
         return CalibrationProblem.of(network, coarse(batches, every_s, lead), every_s)
 
     if lead_rows is None:
-        lead_rows, problem, state, _ = converge_with_lead(machine, problem_at, options, alike)
+        lead_rows, problem, state, _ = converge_with_lead(machine, problem_at, options, noise)
     else:
         problem = problem_at(lead_rows)
-        state, _ = converge(problem, options, noise=alike)
+        state, _ = converge(problem, options, noise=noise)
     own = tuple(coarse(batches, every_s, lead_rows))
     return Point(machine, part, own, problem, state.z, state.nuisance, lead_rows)
 
@@ -134,16 +134,17 @@ def structured(at: Point, runs: int, seed: int = 0, tell: Callable[[str, int, in
     problem = at.problem
     drawn = _structure(at, POLICY.refined_twins, seed, tell)
     blocks = list(problem.linearise(at.x, at.nuisance))
-    known = beyond_recalibration(blocks, _spread(problem.unknowns), imperfections(at))
+    known = orthogonal_to_parameters(blocks, _spread(problem.unknowns), imperfections(at))
     structure = Structure(drawn, known, white_noise(problem))
     return _learned(_begun(at, *_likeliest(at, structure), runs))
 
 
 def _first_calibration(channels: int) -> tuple[FitOptions, Noise]:
-    """How a fit descends from the values of the machine file: all channels alike, so that none is neglected."""
+    """How a fit descends from the values of the machine file: all channels with the same noise, so that none is
+    neglected."""
     factor = np.full(channels, POLICY.initial_noise_factor)
-    alike = Noise(factor, np.full(channels, POLICY.initial_rows_per_value))
-    return FitOptions(max_iterations=POLICY.first_steps, tolerance=POLICY.fit_tolerance_nats), alike
+    noise = Noise(factor, np.full(channels, POLICY.initial_rows_per_value))
+    return FitOptions(max_iterations=POLICY.first_steps, tolerance=POLICY.fit_tolerance_nats), noise
 
 
 def on_all_rows(fitted: Fitted, batches: Sequence[Batch]) -> Fitted:
@@ -184,8 +185,8 @@ def afresh(now: Fitted, part: TwinPart) -> Fitted:
         InputError: the part does not compile; WorkError: the model fails at the priors' means.
     """
     problem = on_network(now.problem, now.batches, compile_network(now.machine, part=part), free_starts=True)
-    options, alike = _first_calibration(len(problem.channels))
-    state, _ = converge(problem, options, noise=alike)
+    options, noise = _first_calibration(len(problem.channels))
+    state, _ = converge(problem, options, noise=noise)
     at = Point(now.machine, part, now.batches, problem, state.z, state.nuisance, now.lead_rows)
     return replace(_under_own(now, at, Hyper(*POLICY.first_hyper)), base=now)
 
@@ -213,7 +214,7 @@ def _learned(begun: Fitted) -> Fitted:
 
 
 def _structure(at: Point, draws: int, seed: int, tell: Callable[[str, int, int], None]) -> list[Array]:
-    """Misfits of refined twins (n_b, draws) beyond what a recalibration takes.
+    """Misfits of refined twins (n_b, draws), orthogonal to the parameters.
 
     A fit that lacks an effect can have values that no machine has, about which few twins can be simulated: they are
     drawn about the nearest ones within `drawn_max_sd` then.
@@ -228,7 +229,7 @@ def _structure(at: Point, draws: int, seed: int, tell: Callable[[str, int, int],
         sizes = np.abs(np.random.default_rng(seed).standard_normal((films[0].shape[1], draws)))
         drawn = [d + f @ sizes for d, f in zip(drawn, films, strict=True)]
         blocks = list(at.problem.linearise(at.x, at.nuisance))
-        return clipped(beyond_recalibration(blocks, _spread(at.problem.unknowns), drawn))
+        return clipped(orthogonal_to_parameters(blocks, _spread(at.problem.unknowns), drawn))
 
     try:
         return about(at)
@@ -237,11 +238,11 @@ def _structure(at: Point, draws: int, seed: int, tell: Callable[[str, int, int],
 
 
 def _likeliest(at: Point, structure: Structure) -> tuple[Covariance, Hyper]:
-    """The covariance and hyperparameters of the largest marginal likelihood, over the share of what each draw alone
-    shows and the sizes of all that is integrated out."""
+    """The covariance and hyperparameters of the largest marginal likelihood, over the share of
+    the specific components and the sizes of all that is integrated out."""
     blocks, begin = list(at.problem.linearise(at.x, at.nuisance)), Hyper(*POLICY.first_hyper)
     best, most = None, -np.inf
-    for share in POLICY.alone_shares:
+    for share in POLICY.specific_shares:
         covariance = learned(at.problem, structure, share)
         marginal = _marginal(covariance, blocks, at)
         hyper, likely = marginal.likeliest(marginal.grams(_columns(marginal, blocks, at)), begin)
@@ -445,7 +446,7 @@ def rows_as_given(fitted: Fitted) -> LeftOutRows:
     return _rows_left(problem, [z] * len(nuisance), nuisance)
 
 
-def worsened(before: LeftOutRows, after: LeftOutRows) -> dict[str, tuple[float, float]]:
+def degraded_channels(before: LeftOutRows, after: LeftOutRows) -> dict[str, tuple[float, float]]:
     """Channels whose left-out rms rises, with the mean over runs before and after in the channel's unit.
 
     A rise counts that is larger than its standard error over runs, each run a sample of its own. So small a rise as

@@ -236,7 +236,7 @@ class Level:
             logs -= float(self._volume[without])
         return -0.5 * (left + logs)
 
-    def foretold(self, grams: Grams) -> Array:
+    def log_predictive_density(self, grams: Grams) -> Array:
         """Log density (B,) of every batch, predicted from all others."""
         products = self.products(grams)
         whole = self._log_evidence(products)

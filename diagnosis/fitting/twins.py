@@ -34,9 +34,9 @@ from twin.simulation import simulate
 class Dice:
     """Random numbers of one refined twin, of each by the name of what it is drawn for.
 
-    Machines that differ by an effect are refined alike in all else, so that evidence under the one's twins and the
-    other's differs by the effect and not by chance (common random numbers, Kahn and Marshall 1953, J. Oper. Res. Soc.
-    Am. 1, 263).
+    Machines that differ by an effect have the same refinement in all else, so that evidence under the one's twins and
+    the other's differs by the effect and not by chance (common random numbers, Kahn and Marshall 1953, J. Oper. Res.
+    Soc. Am. 1, 263).
     """
 
     seed: int

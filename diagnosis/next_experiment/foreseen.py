@@ -29,7 +29,7 @@ EXTRA_SENSOR = "one more sensor at "  # the channel of a sensor that is not ther
 
 @dataclass(frozen=True)
 class Foreseen:
-    """How far A alternatives are apart in R runs: nats (A, A, R) by which the log likelihood of data of the first falls
+    """How well R runs separate A alternatives: nats (A, A, R) by which the log likelihood of data of the first falls
     when the second explains them, both refitted; `with_sensor` (A, A, R, E) with one more sensor at a body of `places`.
     """
 
@@ -56,10 +56,10 @@ def foreseen(alternatives: Sequence[Fitted], runs: Sequence[Run]) -> Foreseen:
     models = [AlternativeModel.of(f, runs, places) for f in alternatives]
     squares = np.zeros((len(models), len(models), len(runs), 1 + len(places)))
     for b, model in enumerate(models):
-        foretold = [model.foretold(m.first) if m is not model else model.expected for m in models]
+        predicted = [model.predicted(m.first) if m is not model else model.expected for m in models]
         for r, block in enumerate(model.blocks):
-            apart = np.column_stack([f[r] - m.shown[r] for f, m in zip(foretold, models, strict=True)])
-            squares[:, b, r] = model.least_squares(block, apart, weight, len(places)).T
+            difference = np.column_stack([f[r] - m.shown[r] for f, m in zip(predicted, models, strict=True)])
+            squares[:, b, r] = model.least_squares(block, difference, weight, len(places)).T
     own = np.einsum("aare->are", squares)[:, None]
     rows = np.array([run.rows * count for run in runs])[:, None]
     nats = np.maximum(0.5 * (squares - own) / (1.0 + own / np.maximum(rows, 1.0)), 0.0)
@@ -108,14 +108,14 @@ class AlternativeModel:
 
     @property
     def expected(self) -> list[Array]:
-        """`foretold` from its own first readings."""
+        """`predicted` from its own first readings."""
         return [block.residual for block in self.blocks]
 
-    def foretold(self, first: Mapping[str, Array]) -> list[Array]:
+    def predicted(self, first: Mapping[str, Array]) -> list[Array]:
         """Minus what this alternative expects, (n_r,) of every run, given the first readings (R,) by channel."""
         return self._started(first).residuals(self.fitted.x, self._none)
 
-    def least_squares(self, block: Block, apart: Array, weight: Array, places: int) -> Array:
+    def least_squares(self, block: Block, difference: Array, weight: Array, places: int) -> Array:
         """What is left (1 + E, A) of A data sets (n, A), without and with each of the E sensors that come last.
 
         The prior is the posterior of the recordings for the parameters and N(0, 1) for the run's own unknowns.
@@ -123,17 +123,17 @@ class AlternativeModel:
         spread = np.array([u.spread for u in self.problem.unknowns])
         scale = np.sqrt(weight[block.channel])[:, None]
         known = scale * np.column_stack([block.nuisance, block.jacobian * spread])
-        apart = scale * apart
+        difference = scale * difference
         root = self.fitted.state.arrow.root
         prior = block_diag(np.eye(block.nuisance.shape[1]), root.T @ root)
         sensors = len(self.problem.network.readings)
         extra = [block.channel == c for c in range(sensors - places, sensors)]
-        there = ~np.any(extra, axis=0) if extra else np.ones(len(apart), bool)
-        gram, cross, square = _sums(known[there], apart[there])
+        there = ~np.any(extra, axis=0) if extra else np.ones(len(difference), bool)
+        gram, cross, square = _sums(known[there], difference[there])
         out = [_left(gram + prior, cross, square)]
         for rows in extra:
             offset = POLICY.extra_sensor_offset_sd_K / self.problem.noise[block.channel[rows][0]] * scale[rows]
-            more = _sums(with_free_offset(known[rows], offset), with_free_offset(apart[rows], offset))
+            more = _sums(with_free_offset(known[rows], offset), with_free_offset(difference[rows], offset))
             out.append(_left(gram + more[0] + prior, cross + more[1], square + more[2]))
         return np.array(out)
 
@@ -155,7 +155,7 @@ def begun(fitted: Fitted, run: Run) -> dict[str, float]:
 
 
 def _before(fitted: Fitted, runs: Sequence[Run], finer: int) -> Array:
-    """The state (R, N) in which every run finds the machine; runs that are prepared alike share one simulation."""
+    """The state (R, N) in which every run finds the machine; runs with the same preparation share one simulation."""
     different: list[Run] = []
     at = []
     for run in runs:
@@ -235,12 +235,12 @@ def _worst(alternatives: Sequence[Fitted], places: int) -> tuple[Array, float]:
     return np.insert(weight, np.full(places, sensors), extra), float(count.sum())
 
 
-def _sums(known: Array, apart: Array) -> tuple[Array, Array, Array]:
-    return known.T @ known, known.T @ apart, np.einsum("na,na->a", apart, apart)
+def _sums(known: Array, difference: Array) -> tuple[Array, Array, Array]:
+    return known.T @ known, known.T @ difference, np.einsum("na,na->a", difference, difference)
 
 
 def _left(system: Array, cross: Array, square: Array) -> Array:
-    """Minimum (A,) of |apart − known y|² + yᵀ prior y."""
+    """Minimum (A,) of |difference − known y|² + yᵀ prior y."""
     return np.asarray(np.maximum(square - np.einsum("pa,pa->a", cross, cho_solve(cho_factor(system), cross)), 0.0))
 
 

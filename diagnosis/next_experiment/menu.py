@@ -180,7 +180,7 @@ class _Shop:
         if not self.room_degC:
             return
         night = {
-            n: ((0.0, T), (self._s(8), self._within(n, T - POLICY.night_fall_K))) for n, T in self.room_degC.items()
+            n: ((0.0, T), (self._s(8), self._within(n, T - POLICY.night_drop_K))) for n, T in self.room_degC.items()
         }
         yield self._run("a night switched off", [(8.0, {})], night, clock_h=POLICY.evening_h)
         on_s, warm_s, end_s = self._s(0.5), self._s(0.5) + self._s(1), self._s(8)

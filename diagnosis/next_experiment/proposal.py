@@ -117,7 +117,7 @@ def next_experiment(
 
 
 def _needed_nats(names: Sequence[str], lacking_nats: Mapping[str, float]) -> Array:
-    """What each pair (P,) must be apart: what the second lacks against the first, else what decides a tie."""
+    """The nats (P,) that separate each pair: what the second lacks against the first, else what decides a tie."""
     return np.array(
         [
             max(lacking_nats.get(second, 0.0) if first == names[0] else 0.0, POLICY.decisive_nats)

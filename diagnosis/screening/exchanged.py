@@ -109,10 +109,10 @@ class _Line:
             a, c = np.flatnonzero(m.channel == one), np.flatnonzero(m.channel == other)
             _, first, second = np.intersect1d(m.row[a], m.row[c], assume_unique=True, return_indices=True)
             a, c = a[first], c[second]
-            apart = m.value[c] - m.value[a]
+            difference = m.value[c] - m.value[a]
             yield [
-                (one, j[a], r[a], r[a] + apart / self.noise[one]),
-                (other, j[c], r[c], r[c] - apart / self.noise[other]),
+                (one, j[a], r[a], r[a] + difference / self.noise[one]),
+                (other, j[c], r[c], r[c] - difference / self.noise[other]),
             ]
 
     def _cost(self, batches: Sequence[Sequence[_Channel]]) -> float:

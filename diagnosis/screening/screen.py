@@ -151,7 +151,7 @@ def _largest_rms(fitted: Fitted, seen: Signatures) -> Array:
     return np.asarray(np.sqrt(squares / np.maximum(fitted.rows, 1.0)[:, None]).max(axis=0))
 
 
-def likeness(fitted: Fitted, seen: Screen, scored: Sequence[Scored]) -> Array:
+def similarity(fitted: Fitted, seen: Screen, scored: Sequence[Scored]) -> Array:
     """|cos| (k, k) between signatures once recalibration and structure are projected out."""
     marginal, p = fitted.marginal, len(fitted.z)
     which = [s.column for s in scored]

@@ -2,7 +2,7 @@
 
 What a wrong claim gains in nats grows with the recordings and with what a network cannot represent. So a claim is
 judged by what it gains relative to the log evidence of the fit before it. Offset and weight are fitted to development
-cases of several kinds of machine (`results/claims.csv`). Of the other figures that stand there (odds of the mechanism,
+cases of several kinds of machine (`results/claims.csv`). Of the other figures there (odds of the mechanism,
 lead over what differs, share of runs) none makes it better, left-out kinds judged.
 """
 
@@ -64,7 +64,7 @@ class Round:
         return self.tried[0] if self.tried else None
 
     @property
-    def trust(self) -> float:
+    def claim_probability(self) -> float:
         """The probability that the first is true, or one that recordings cannot distinguish from it."""
         if self.figures is None:
             return 0.0
@@ -72,7 +72,7 @@ class Round:
 
     @property
     def accepted(self) -> bool:
-        return self.trust >= POLICY.claim_min_probability
+        return self.claim_probability >= POLICY.claim_min_probability
 
     @property
     def threshold(self) -> float:
@@ -95,21 +95,21 @@ def differs(one: Tried, other: Tried) -> bool:
     return a.mechanism != b.mechanism and a.where.name != b.where.name and one.cluster != other.cluster
 
 
-def alike(one: Tried, other: Tried) -> bool:
-    """Whether a user acts on both explanations alike: recordings cannot distinguish them, or they are of one place and
-    nearly as likely."""
+def indistinguishable(one: Tried, other: Tried) -> bool:
+    """Whether a user acts on both explanations in the same way: recordings cannot distinguish them, or they are of one
+    place and nearly as likely."""
     same_place = one.candidate.where == other.candidate.where
-    close = abs(one.standing - other.standing) < POLICY.decisive_nats
+    close = abs(one.score - other.score) < POLICY.decisive_nats
     return one.cluster == other.cluster or (same_place and close)
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """A candidate with its probability; `alike` where the recordings cannot distinguish it from the best."""
+    """A candidate with its probability, and whether the recordings cannot distinguish it from the best."""
 
     tried: Tried
     probability: float
-    alike: bool
+    indistinguishable: bool
 
 
 def probability_cap(runs: int) -> float:
@@ -121,24 +121,25 @@ def probability_cap(runs: int) -> float:
 def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     """Of a round's candidates, the claim first; then of nothing, and of something that is not listed: they add to 1.
 
-    The claim, with all that is alike, has the probability of its figures. The rest is shared in proportion to gains and
-    odds, tempered by what structure scatters gains by; nothing is as likely as an effect that would just be claimed.
+    The claim, with all that is indistinguishable from it, has the probability of its figures. The rest is shared in
+    proportion to gains and odds, tempered by what structure scatters gains by; nothing is as likely as an effect that
+    would just be claimed.
     """
     runs = done.before.runs or len(done.before.batches)
     best = done.best
-    top = best.standing if best is not None else 0.0
+    top = best.score if best is not None else 0.0
     scale = max(POLICY.temperature_share * max(top, done.threshold), POLICY.temperature_min_nats)
     other = done.threshold - np.log(POLICY.unlisted_odds) * scale
-    standing = np.array([t.standing for t in done.tried] + [done.threshold, other])
+    score = np.array([t.score for t in done.tried] + [done.threshold, other])
     if done.resolved:
-        standing[-2] = -np.inf
+        score[-2] = -np.inf
     if best is None:
-        weight = softmax(standing / scale)
+        weight = softmax(score / scale)
         return [], float(weight[-2]), float(weight[-1])
-    like = np.array([t is best or alike(best, t) for t in done.tried] + [False, False])
-    own = min(done.trust, probability_cap(runs))
-    weight = np.empty(len(standing))
-    weight[like], weight[~like] = own * softmax(standing[like] / scale), (1.0 - own) * softmax(standing[~like] / scale)
+    like = np.array([t is best or indistinguishable(best, t) for t in done.tried] + [False, False])
+    own = min(done.claim_probability, probability_cap(runs))
+    weight = np.empty(len(score))
+    weight[like], weight[~like] = own * softmax(score[like] / scale), (1.0 - own) * softmax(score[~like] / scale)
     every = zip(done.tried, weight.tolist(), like.tolist(), strict=False)
     out = [Explanation(t, p, a) for t, p, a in every]
     return [out[0], *sorted(out[1:], key=lambda e: -e.probability)], float(weight[-2]), float(weight[-1])

@@ -15,7 +15,7 @@ from diagnosis.fitting.fitted import afresh
 from diagnosis.localisation.balance import impossible
 from diagnosis.policy import POLICY
 from diagnosis.screening.exchanged import suspected_swaps
-from diagnosis.screening.screen import Screen, likeness, one_of_each
+from diagnosis.screening.screen import Screen, one_of_each, similarity
 from diagnosis.search.claims import least_relative_gain
 from twin.compile import own_paths
 from twin.mechanisms import MECHANISMS
@@ -85,10 +85,15 @@ def refits(
             gain = fitted.log_evidence - now.log_evidence
             out.append(
                 Tried(
-                    s, fitted, gain, fitted.foretold - now.foretold, clusters.get(c.name, c.name), odds.get(c.name, 0.0)
+                    s,
+                    fitted,
+                    gain,
+                    fitted.log_predictive_density - now.log_predictive_density,
+                    clusters.get(c.name, c.name),
+                    odds.get(c.name, 0.0),
                 )
             )
-    return sorted(out, key=lambda t: -t.standing)
+    return sorted(out, key=lambda t: -t.score)
 
 
 def refit(now: Fitted, s: Scored) -> Fitted | None:
@@ -115,5 +120,5 @@ def _clusters(now: Fitted, seen: Screen, work: Sequence[Scored]) -> dict[str, st
     shown = [s for s in work if s.column >= 0]
     if not shown:
         return {}
-    alike = likeness(now, seen, shown) > POLICY.same_signature_cosine
-    return {s.candidate.name: shown[int(alike[k].argmax())].candidate.name for k, s in enumerate(shown)}
+    same = similarity(now, seen, shown) > POLICY.same_signature_cosine
+    return {s.candidate.name: shown[int(same[k].argmax())].candidate.name for k, s in enumerate(shown)}

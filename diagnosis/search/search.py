@@ -118,7 +118,7 @@ def decided(done: Round) -> Round:
     before, anew = _fair(done.before, done.tried), None
     tried = [_against(before, t) for t in done.tried]
     for left in range(POLICY.confirmed, -1, -1):
-        tried.sort(key=lambda t: (not _resolves(t, strange), not (left or t.confirmed), -t.standing))
+        tried.sort(key=lambda t: (not _resolves(t, strange), not (left or t.confirmed), -t.score))
         first, found = tried[0], figures(before, tried)
         resolved = _resolves(first, strange)
         if not left or first.confirmed or resolved or found.probability < POLICY.claim_min_probability:
@@ -144,7 +144,7 @@ def _confirmed(t: Tried, before: Fitted) -> Tried:
 def _fair(now: Fitted, tried: Sequence[Tried]) -> Fitted:
     """The fit before at the best optimum that is known without an effect: what the likeliest explanation has found on
     its way, and would keep without its effect, is no gain of that effect."""
-    best, first = relearned(now), max(tried, key=lambda t: t.standing)
+    best, first = relearned(now), max(tried, key=lambda t: t.score)
     with suppress(InputError, WorkError):  # where it has gone with the effect, no machine without it is
         back = refitted(first.fitted, now.part)
         best = back if back.log_evidence > best.log_evidence else best
@@ -152,7 +152,10 @@ def _fair(now: Fitted, tried: Sequence[Tried]) -> Fitted:
 
 
 def _against(before: Fitted, t: Tried) -> Tried:
-    gain, by_run = t.fitted.log_evidence - before.log_evidence, t.fitted.foretold - before.foretold
+    gain, by_run = (
+        t.fitted.log_evidence - before.log_evidence,
+        t.fitted.log_predictive_density - before.log_predictive_density,
+    )
     return replace(t, gain=gain, by_run=by_run, confirmed=False)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from data.arrays import Array
 from diagnosis.contracts import Scored
-from diagnosis.fitting.covariance import beyond_recalibration, slices_of
+from diagnosis.fitting.covariance import orthogonal_to_parameters, slices_of
 from diagnosis.policy import POLICY
 from diagnosis.search.claims import Round
 from diagnosis.search.search import Search
@@ -61,7 +61,7 @@ class _Sums:
             np.column_stack([x[:, at], b.residual]) for x, b in zip(done.screen.signatures.columns, blocks, strict=True)
         ]
         gram = np.zeros((len(now.rows), len(at) + 1, len(at) + 1))
-        for m, rows in zip(now.problem.measured, beyond_recalibration(blocks, spread, every), strict=True):
+        for m, rows in zip(now.problem.measured, orthogonal_to_parameters(blocks, spread, every), strict=True):
             for c, where in slices_of(m.channel):
                 gram[c] += rows[where].T @ rows[where]
         return cls(gram, now.rows, now.rows, *bounds(news))

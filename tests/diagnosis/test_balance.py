@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from diagnosis.diagnose import diagnose
-from diagnosis.fitting.fitted import LeftOutRows, left_out_rows, rows_as_given, worsened
+from diagnosis.fitting.fitted import LeftOutRows, degraded_channels, left_out_rows, rows_as_given
 from diagnosis.localisation.balance import impossible
 from tests.diagnosis.small_cases import cold_floor, consistent, fitted, runs, two_bodies
 
@@ -20,8 +20,8 @@ def left(**by_channel: list[float]) -> LeftOutRows:
 def test_a_channel_is_worse_where_its_rise_is_more_than_other_runs_would_make() -> None:
     before = left(t1=[1.0, 1.2, 0.8, 1.0], t2=[1.0, 1.0, 1.0, 1.0], t3=[2.0, 2.0, 2.0, 2.0])
     after = left(t1=[1.1, 1.3, 0.8, 1.0], t2=[4.0, 4.5, 5.0, 4.5], t3=[1.0, 1.0, 1.0, 1.0])
-    assert worsened(before, after) == {"t2": (1.0, 4.5)}
-    assert worsened(after, before) == {"t3": (1.0, 2.0)}
+    assert degraded_channels(before, after) == {"t2": (1.0, 4.5)}
+    assert degraded_channels(after, before) == {"t3": (1.0, 2.0)}
 
 
 def test_a_part_that_warms_without_heat_is_impossible_and_the_watts_are_stated() -> None:
@@ -45,8 +45,8 @@ def test_the_missing_path_is_found_and_no_channel_is_worse() -> None:
     assert any("t_head warms by" in r for r in answer.remarks)
     search = done.search
     assert search is not None
-    assert worsened(left_out_rows(search.baseline), left_out_rows(search.final)) == {}
-    assert worsened(rows_as_given(search.baseline), left_out_rows(search.final)) == {} and done.added
+    assert degraded_channels(left_out_rows(search.baseline), left_out_rows(search.final)) == {}
+    assert degraded_channels(rows_as_given(search.baseline), left_out_rows(search.final)) == {} and done.added
 
 
 def test_the_file_as_given_is_predicted_by_its_own_values() -> None:

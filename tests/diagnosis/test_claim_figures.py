@@ -14,10 +14,10 @@ from diagnosis.policy import POLICY
 from diagnosis.search.claims import (
     Figures,
     Round,
-    alike,
     differs,
     explanations,
     figures,
+    indistinguishable,
     least_relative_gain,
     probability_cap,
 )
@@ -106,13 +106,13 @@ def test_what_gains_nothing_is_not_claimed() -> None:
 
 
 def test_a_round_claims_what_is_probable_or_alone_possible() -> None:
-    assert judged(SINK).accepted and judged(SINK).trust == judged(SINK).figures.probability  # type: ignore[union-attr]
+    assert judged(SINK).accepted and judged(SINK).claim_probability == judged(SINK).figures.probability  # type: ignore[union-attr]
     weak = tried("floor_sink", "bed", 0.1)
     assert not judged(weak).accepted
-    assert judged(weak, resolved="t_bed").trust == POLICY.max_probability
+    assert judged(weak, resolved="t_bed").claim_probability == POLICY.max_probability
     assert judged(weak, resolved="t_bed").accepted
     bare = Round(before(), SCREEN, ())
-    assert bare.trust == 0.0 and not bare.accepted and bare.best is None
+    assert bare.claim_probability == 0.0 and not bare.accepted and bare.best is None
 
 
 def test_the_threshold_in_nats_grows_with_the_log_evidence() -> None:
@@ -127,26 +127,28 @@ def test_the_threshold_in_nats_grows_with_the_log_evidence() -> None:
 
 
 def test_alike_is_what_recordings_or_a_user_do_not_distinguish() -> None:
-    assert alike(SINK, tried("radiation", "head", 10.0, cluster=SINK.cluster))
+    assert indistinguishable(SINK, tried("radiation", "head", 10.0, cluster=SINK.cluster))
     near = 0.9 * POLICY.decisive_nats
-    assert alike(SINK, tried("radiation", "bed", SINK.gain - near))
-    assert not alike(SINK, tried("radiation", "bed", SINK.gain - 2.0 * near))
-    assert not alike(SINK, tried("radiation", "head", SINK.gain - near))
+    assert indistinguishable(SINK, tried("radiation", "bed", SINK.gain - near))
+    assert not indistinguishable(SINK, tried("radiation", "bed", SINK.gain - 2.0 * near))
+    assert not indistinguishable(SINK, tried("radiation", "head", SINK.gain - near))
 
 
 @pytest.mark.parametrize("resolved", ["", "t_bed"])
 @pytest.mark.parametrize("runs", [1, 3, 12])
-def test_probabilities_add_to_one_and_the_claim_shares_its_own_with_what_is_alike(runs: int, resolved: str) -> None:
+def test_probabilities_add_to_one_and_the_claim_shares_its_own_with_what_is_indistinguishable(
+    runs: int, resolved: str
+) -> None:
     same = tried("radiation", "bed", 299.0, cluster=SINK.cluster)
     rival, weak = tried("draught", "head", 280.0), tried("sun", "head", 3.0)
     done = judged(SINK, same, rival, weak, runs=runs, resolved=resolved)
     every, nothing, unlisted = explanations(done)
     assert sum(e.probability for e in every) + nothing + unlisted == pytest.approx(1.0)
-    assert every[0].tried is SINK and {e.tried.candidate.name for e in every if e.alike} == {
+    assert every[0].tried is SINK and {e.tried.candidate.name for e in every if e.indistinguishable} == {
         "floor_sink_bed", "radiation_bed",
     }  # fmt: skip
-    own = sum(e.probability for e in every if e.alike)
-    assert own == pytest.approx(min(done.trust, probability_cap(runs)))
+    own = sum(e.probability for e in every if e.indistinguishable)
+    assert own == pytest.approx(min(done.claim_probability, probability_cap(runs)))
     assert all(0.0 <= e.probability <= 1.0 for e in every) and unlisted > 0.0
     assert (nothing == 0.0) == bool(resolved)
     rest = [e.probability for e in every[1:]]
@@ -162,5 +164,5 @@ def test_a_claim_that_alone_is_possible_keeps_its_probability_however_much_other
     """Another one gains more, and leaves unexplained what the recordings show and the twin cannot do."""
     done = judged(tried("heat_bridge", "head", 60.0), tried("sensor_drift", "t_head", 9e4), resolved="t_head")
     every, nothing, unlisted = explanations(done)
-    assert every[0].probability == pytest.approx(min(done.trust, probability_cap(RUNS)))
+    assert every[0].probability == pytest.approx(min(done.claim_probability, probability_cap(RUNS)))
     assert sum(e.probability for e in every) + nothing + unlisted == pytest.approx(1.0)

@@ -16,7 +16,7 @@ from data.machine import Machine
 from diagnosis.contracts import COLUMNS
 from diagnosis.diagnose import diagnose
 from diagnosis.findings.schema import Findings
-from diagnosis.fitting.fitted import left_out_rows, rows_as_given, worsened
+from diagnosis.fitting.fitted import degraded_channels, left_out_rows, rows_as_given
 from diagnosis.policy import POLICY
 from diagnosis.result import Diagnosis
 from tests.diagnosis.small_cases import runs, two_bodies
@@ -60,8 +60,8 @@ def test_no_channel_is_predicted_worse_than_before_or_than_by_the_file_as_given(
     done = diagnosed(verdict)
     assert done.search is not None
     after = left_out_rows(done.search.final)
-    assert worsened(left_out_rows(done.search.baseline), after) == {}
-    assert not done.values or worsened(rows_as_given(done.search.baseline), after) == {}  # noqa: PD011 - no frame
+    assert degraded_channels(left_out_rows(done.search.baseline), after) == {}
+    assert not done.values or degraded_channels(rows_as_given(done.search.baseline), after) == {}  # noqa: PD011 - no frame
 
 
 @pytest.mark.parametrize("verdict", [EXPLAINED, UNLISTED, LONGEST])

@@ -69,7 +69,7 @@ def test_what_is_not_known_is_null_and_what_is_not_certain_is_below_one() -> Non
     assert Findings.from_json(told).seconds is None
 
 
-def test_an_alternative_of_an_older_file_is_not_alike() -> None:
+def test_an_alternative_of_an_older_file_is_distinguishable() -> None:
     plain = {"mechanism": "radiation", "where": BED, "probability": 0.02}
     older = changed(findings=[RAW["findings"][0] | {"alternatives": [plain]}])
     (now,), (then,) = (Findings.from_json(raw).findings[0].alternatives for raw in (RAW, older))

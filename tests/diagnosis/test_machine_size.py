@@ -38,7 +38,7 @@ def _smaller(given: Any) -> Any:
     return f"{float(number) / 1e3:g} {unit}"
 
 
-def standing(machine: Any) -> Fitted:
+def at_rest(machine: Any) -> Fitted:
     """As much of a fit as a size needs."""
     network = compile_network(machine)
     given = {"problem": SimpleNamespace(network=network), "values": network.values}
@@ -51,8 +51,8 @@ def bridge(conductance_W_per_K: float) -> Scored:
 
 
 def test_a_machine_tool_is_of_the_usual_size_and_grams_are_not() -> None:
-    assert size_of(cold_floor()) == size_of(standing(four_bodies())) == 1.0
-    small = size_of(standing(of_grams()))
+    assert size_of(cold_floor()) == size_of(at_rest(four_bodies())) == 1.0
+    small = size_of(at_rest(of_grams()))
     assert 1e-4 < small < 1e-3
     links_W_per_K = (15e-3 * 15e-3 * 20e-3 * 1e-3 * 4e-3 * 10e-3) ** (1 / 6)
     assert small == pytest.approx(links_W_per_K / POLICY.typical_conductance_W_per_K)

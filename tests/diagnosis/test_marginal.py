@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 
 from data.arrays import Array
 from data.errors import WorkError
-from diagnosis.fitting.covariance import Covariance, alone_in, clipped
+from diagnosis.fitting.covariance import Covariance, clipped, specific_component
 from diagnosis.fitting.marginal import Grams, Hyper, Marginal
 from diagnosis.policy import POLICY
 
@@ -85,8 +85,8 @@ def test_the_evidence_is_a_normal_density_at_any_sizes(hyper: Hyper) -> None:
 
 
 @every_hyper
-def test_a_left_out_batch_is_foretold_by_its_conditional_density(hyper: Hyper) -> None:
-    got = marginal().level(hyper).foretold(grams("model", "target"))
+def test_a_left_out_batch_has_its_conditional_density(hyper: Hyper) -> None:
+    got = marginal().level(hyper).log_predictive_density(grams("model", "target"))
     for b in ALL:
         rest = [k for k in ALL if k != b]
         assert got[b] == pytest.approx(dense(["model"], ALL, hyper) - dense(["model"], rest, hyper))
@@ -163,11 +163,11 @@ def test_what_is_left_is_least(hyper: Hyper) -> None:
     np.testing.assert_allclose(np.concatenate(left), aim - every @ taken)
 
 
-def test_a_draw_is_alone_in_what_no_other_shows() -> None:
+def test_the_specific_component_of_a_draw_is_what_no_other_shows() -> None:
     rng = np.random.default_rng(0)
     base = 100.0 * rng.standard_normal((40, 2))
     shared = [np.column_stack([base, base @ [1.0, 1.0], rng.standard_normal(40)])]
-    alone = alone_in(shared)[0]
+    alone = specific_component(shared)[0]
     assert np.linalg.norm(alone[:, :3], axis=0).max() < 3.0
     assert np.linalg.norm(alone[:, 3]) > 0.8 * np.linalg.norm(shared[0][:, 3])
 

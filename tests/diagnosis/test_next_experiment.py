@@ -142,7 +142,7 @@ def test_foreseen_is_the_least_squares_after_a_refit(bare: bool, number: int) ->
 
     def left(model: AlternativeModel) -> float:
         block, spread = model.blocks[0], np.array([u.spread for u in model.problem.unknowns])
-        apart = model.foretold(truth.first)[0] - truth.shown[0]
+        apart = model.predicted(truth.first)[0] - truth.shown[0]
         scale = np.sqrt(weight[block.channel])
         root, q = model.fitted.state.arrow.root, block.nuisance.shape[1]
         rows = scale[:, None] * np.hstack([block.nuisance, block.jacobian * spread])
@@ -163,7 +163,7 @@ def test_a_rival_begins_where_the_sensors_say() -> None:
     sensor = alternatives[0].problem.network.readings[0]
     warmer = {n: v + 1.5 for n, v in model.first.items()}
     for r in range(2):
-        before, after = (-sensor.noise * model.foretold(first)[r][0] for first in (model.first, warmer))
+        before, after = (-sensor.noise * model.predicted(first)[r][0] for first in (model.first, warmer))
         assert before == pytest.approx(model.first["t_shaft"][r], abs=1e-3)
         assert after - before == pytest.approx(1.5, abs=1e-3)
 

@@ -13,7 +13,7 @@ from data.errors import InputError, WorkError
 from data.processes import Processes
 from diagnosis.candidates.discretisation import never_reported, slack
 from diagnosis.contracts import Fitted
-from diagnosis.fitting.fitted import left_out_rows, plain, worsened
+from diagnosis.fitting.fitted import degraded_channels, left_out_rows, plain
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import proposed
 from diagnosis.search import refits as refits_module
@@ -67,9 +67,9 @@ def test_a_cold_floor_is_found_with_its_size() -> None:
 @pytest.mark.integration
 def test_a_claim_is_probable_and_no_channel_is_predicted_worse() -> None:
     for r in found("drift and shift").accepted:
-        assert r.best is not None and r.trust >= POLICY.claim_min_probability
+        assert r.best is not None and r.claim_probability >= POLICY.claim_min_probability
         assert r.best.gain > 0 and float(r.best.by_run.sum()) > 0
-        assert not worsened(left_out_rows(r.before), left_out_rows(r.best.fitted))
+        assert not degraded_channels(left_out_rows(r.before), left_out_rows(r.best.fitted))
 
 
 def test_where_nothing_is_missing_nothing_is_accepted() -> None:
@@ -226,4 +226,4 @@ def test_processes_do_not_matter() -> None:
     one, two = first_round(1), first_round(2)
     assert [t.candidate.name for t in one.tried] == [t.candidate.name for t in two.tried]
     assert [t.gain for t in one.tried] == pytest.approx([t.gain for t in two.tried], rel=1e-6)
-    assert two.accepted and two.trust == pytest.approx(one.trust)
+    assert two.accepted and two.claim_probability == pytest.approx(one.claim_probability)

@@ -94,7 +94,7 @@ def test_a_tie_is_said_as_one() -> None:
         "These runs cannot distinguish two explanations: radiation to walls or from a hot neighbour at the bed "
         "(surrounding: the room) (92 %) or heat to the floor at the bed, 10 W/K (90 %: 9–12) (under 1 %)"
     )
-    unlike = replace(tied, probability=0.52, others=(replace(tied.others[0], alike=False),))
+    unlike = replace(tied, probability=0.52, others=(replace(tied.others[0], indistinguishable=False),))
     assert claim_phrase(unlike).startswith("Perhaps (52 %) missing: heat to the floor")
 
 
