@@ -21,11 +21,11 @@ from diagnosis.drafting.draft import drafted_part
 from diagnosis.export.machine_file import changed_parts, with_deviations
 from diagnosis.findings import report_data as made
 from diagnosis.findings.conclude import (
-    found_of,
+    build_effect,
     residual_remarks,
     rms_of,
     slow_residual_ratio,
-    unlisted_found,
+    unlisted_effect,
     verdict_of,
 )
 from diagnosis.findings.report_data import Rms, place_label
@@ -38,7 +38,7 @@ from diagnosis.findings.schema import (
     NextExperiment,
     Place,
 )
-from diagnosis.findings.statement import finding_of, verdict_statement
+from diagnosis.findings.statement import build_finding, verdict_statement
 from diagnosis.fitting.batches import enough_batches, usable_batches
 from diagnosis.fitting.fitted import (
     baseline,
@@ -87,12 +87,12 @@ def diagnose(
     begun = time.perf_counter()
     check(machine, batches)
     batches = sorted(batches, key=lambda b: b.batch_id)  # what is drawn for each must not depend on their order
-    tell = progress or (lambda step, n, of: None)
+    report = progress or (lambda step, n, of: None)
     with Processes(processes, start_worker) as workers:
         workers.warm_up()
         remarks: list[str] = []
         if machine.twin is None:
-            draft = drafted_part(machine, batches, progress=lambda what, n, of: tell("draft", n, of))
+            draft = drafted_part(machine, batches, progress=lambda what, n, of: report("draft", n, of))
             part = draft.part
             remarks += draft.remarks
         else:
@@ -102,12 +102,12 @@ def diagnose(
         recordings = tuple(b.batch_id for b in batches)
         batches, more = enough_batches(batches)
         remarks += more
-        fitted = baseline(machine, part, batches, tell, len(recordings), seed)
-        done = search(fitted, workers, tell)
+        fitted = baseline(machine, part, batches, report, len(recordings), seed)
+        done = search(fitted, workers, report)
         if done.accepted and (lead_rows := lead_of(machine, done.final.part, batches)) != fitted.lead_rows:
             # what was missing had passed for drivers that act at another time
-            done = search(baseline(machine, part, batches, tell, len(recordings), seed, lead_rows), workers, tell)
-        tell("left out", 0, 0)
+            done = search(baseline(machine, part, batches, report, len(recordings), seed, lead_rows), workers, report)
+        report("left out", 0, 0)
         first = _located(done.baseline, done.baseline.batches)
     located: dict[str, pd.DataFrame] = {}
     if isinstance(first, str):
@@ -121,10 +121,10 @@ def diagnose(
     return replace(diagnosis, findings=diagnosis.findings.model_copy(update={"seconds": seconds}))
 
 
-def _located(fitted: Fitted, batches: Sequence[Batch], tell: Progress | None = None) -> Located | str:
+def _located(fitted: Fitted, batches: Sequence[Batch], report: Progress | None = None) -> Located | str:
     """The map of what a fit cannot explain, or why there is none."""
     try:
-        return locate(fitted.problem, fitted.x, fitted.own, batches, progress=tell)
+        return locate(fitted.problem, fitted.x, fitted.own, batches, progress=report)
     except (InputError, WorkError) as error:
         return str(error)
 
@@ -172,17 +172,17 @@ def _diagnosis(
         remarks += (f"the machine file keeps its values and parts: the fitted ones raise {made.rises(worse, units)}",)
     run, possible = deciding_run(named), []
     separates = run.label if run is not None else ""
-    found = []
+    effects = []
     for r, left in pairs:
         own_rms = rms_of(made.rms_table(left, after, final), final)
-        one = found_of(done, r, part_after, intervals, own_rms, separates)
+        one = build_effect(done, r, part_after, intervals, own_rms, separates)
         if one.kind.is_unlisted and r.best is not None:
-            one = unlisted_found(one, r.forms[r.best.candidate.name], final, r.best.candidate, intervals)
-        found.append(one)
-    found = sorted(found, key=lambda f: -f.probability) if len(found) > 1 else found
+            one = unlisted_effect(one, r.forms[r.best.candidate.name], final, r.best.candidate, intervals)
+        effects.append(one)
+    effects.sort(key=lambda f: -f.probability)
     slow = slow_residual_ratio(rms, final)
-    listed = [f for f in found if not f.kind.is_unlisted]
-    verdict = verdict_of(listed, len(listed) < len(found), rms, slow, final.runs)
+    listed = [f for f in effects if not f.kind.is_unlisted]
+    verdict = verdict_of(listed, len(listed) < len(effects), rms, slow, final.runs)
     if run is None and verdict != "explained":
         run = revealing_run(done)
         possible = [n for n in run.separates if n != NOTHING] if run is not None else []
@@ -190,11 +190,11 @@ def _diagnosis(
     last = done.rounds[-1]
     table = limits(last.before, last.screen, last.threshold)
     detection_limits = _detection_limits(table)
-    findings = tuple(finding_of(f) for f in found)
-    better = int((_per_batch(rms_table, "after") < _per_batch(rms_table, "before")).sum()) if found else 0
+    findings = tuple(build_finding(f) for f in effects)
+    better = int((_per_batch(rms_table, "after") < _per_batch(rms_table, "before")).sum()) if effects else 0
     statement = verdict_statement(
         verdict,
-        found,
+        effects,
         rms,
         detection_limits,
         separates=run.label if run is not None else "",

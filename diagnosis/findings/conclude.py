@@ -11,7 +11,7 @@ import pandas as pd
 from data.arrays import Array
 from diagnosis.candidates.free_forms import Form, phrases
 from diagnosis.contracts import Candidate, Fitted
-from diagnosis.findings.report_data import Estimate, Found, Other, Rms, beyond_noise, context_label, place_label
+from diagnosis.findings.report_data import Effect, Estimate, Other, Rms, beyond_noise, context_label, place_label
 from diagnosis.findings.schema import Verdict
 from diagnosis.policy import POLICY, Policy
 from diagnosis.search.claims import Explanation, Round, explanations, probability_cap, reported
@@ -141,9 +141,9 @@ def rms_of(table: pd.DataFrame, fitted: Fitted) -> tuple[Rms, ...]:
     return tuple(sorted(out, key=lambda r: (r.sensor, -r.before / max(r.after, 1e-12))))
 
 
-def found_of(
+def build_effect(
     search: Search, done: Round, part: TwinPart, intervals: Mapping[str, Interval], rms: Sequence[Rms], separates: str
-) -> Found:
+) -> Effect:
     """One accepted round as a finding.
 
     Args:
@@ -158,7 +158,7 @@ def found_of(
     parameters, was = reported_parameters(final, c, intervals)
     regime, windows = activity(final, c)
     return replace(
-        claimed(done, part, final),
+        claimed_effect(done, part, final),
         parameters=parameters,
         name=c.name if c.part is not None else "",
         regime=regime,
@@ -183,20 +183,22 @@ def found_of(
     )
 
 
-def unlisted_found(found: Found, form: Form, final: Fitted, c: Candidate, intervals: Mapping[str, Interval]) -> Found:
+def unlisted_effect(
+    effect: Effect, form: Form, final: Fitted, c: Candidate, intervals: Mapping[str, Interval]
+) -> Effect:
     """A finding of no listed mechanism: its term, and its watts or displacement."""
     head = f"mechanisms.{c.name}."
     stated = {n.removeprefix(head): i for n, i in intervals.items() if n.startswith(head)}
     return replace(
-        found,
+        effect,
         parameters={n: Estimate(i.value, i.unit, i.low, i.high) for n, i in stated.items()},
         context=f"it follows {form.label}",
-        evidence={**found.evidence, "follows": phrases([form], {n: i.value for n, i in stated.items()})},
+        evidence={**effect.evidence, "follows": phrases([form], {n: i.value for n, i in stated.items()})},
         size=Estimate(usual_size(final, c), "W" if form.heat else "um"),
     )
 
 
-def claimed(done: Round, part: TwinPart, final: Fitted) -> Found:
+def claimed_effect(done: Round, part: TwinPart, final: Fitted) -> Effect:
     """The best of a round with its probability and the alternatives; `final` is the fit that it is reported from."""
     every, _, _ = explanations(done)
     best = next(e for e in every if e.tried is done.best)
@@ -204,7 +206,7 @@ def claimed(done: Round, part: TwinPart, final: Fitted) -> Found:
     own = [e for e in every if e is best or e.indistinguishable]
     same = [e for e in own if (e.tried.candidate.mechanism, e.tried.candidate.where) == (c.mechanism, c.where)]
     rest = [e for e in every if e not in same]
-    return Found(
+    return Effect(
         mechanism=c.mechanism,
         where=c.where,
         place=_place_of(c, part),
@@ -326,18 +328,18 @@ def moved_rms(fitted: Fitted) -> dict[str, float]:
 
 
 def verdict_of(
-    found: Sequence[Found], more: bool, rms: Sequence[Rms], slow: float, runs: int, policy: Policy = POLICY
+    effects: Sequence[Effect], more: bool, rms: Sequence[Rms], slow: float, runs: int, policy: Policy = POLICY
 ) -> Verdict:
     """The verdict on all effects of listed mechanisms: they explain the difference where they leave noise alone.
 
     Args:
         more: whether the residual follows something that no listed mechanism does.
-        rms: of batches left out, after all that was found.
+        rms: of batches left out, with all effects.
         slow: `slow_residual_ratio`.
     """
-    if not found:
+    if not effects:
         return "unlisted" if more else "undecidable" if slow > max_residual_ratio(runs, policy) else "consistent"
-    if found[0].probability < POLICY.stands_alone_probability and found[0].tied:
+    if effects[0].probability < POLICY.stands_alone_probability and effects[0].tied:
         return "undecidable"
     return "partly_explained" if more or (policy.checks_residual and beyond_noise(rms)) else "explained"
 

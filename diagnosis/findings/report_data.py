@@ -40,8 +40,8 @@ class Estimate:
 
 def with_unit(number: str, unit: str) -> str:
     """``10 W/K``, ``0.035/K`` for 1/K, ``0.4`` for a share."""
-    said = unit_label(unit)
-    return f"{number}{said[1:]}" if said.startswith("1/") else f"{number} {said}".strip()
+    label = unit_label(unit)
+    return f"{number}{label[1:]}" if label.startswith("1/") else f"{number} {label}".strip()
 
 
 def of_error(value: float, unit: str) -> str:
@@ -101,7 +101,7 @@ def _fixed(value: float, decimals: int) -> str:
 
 @dataclass(frozen=True)
 class Rms:
-    """Left-out errors of one channel without and with what was found, in `unit`; `noise` is what noise alone leaves."""
+    """Left-out errors of one channel without and with the effects, in `unit`; `noise` is the given noise."""
 
     channel: str
     unit: str
@@ -133,7 +133,7 @@ class Other:
 
 
 @dataclass(frozen=True)
-class Found:
+class Effect:
     """One effect that a diagnosis found.
 
     Attributes:
@@ -249,8 +249,8 @@ def empty_tables() -> dict[str, pd.DataFrame]:
 def rises(worse: Mapping[str, tuple[float, float]], units: Mapping[str, str]) -> str:
     """``the left-out error of T1 from 1.4 to 4.5 K``, of every channel that got worse, the largest ratio first."""
     first = sorted(worse, key=lambda c: worse[c][0] / worse[c][1])
-    said = [f"{c} from {few(worse[c][0])} to {of_error(worse[c][1], units[c])}" for c in first]
-    return f"the left-out error of {listed(said)}"
+    phrases = [f"{c} from {few(worse[c][0])} to {of_error(worse[c][1], units[c])}" for c in first]
+    return f"the left-out error of {listed(phrases)}"
 
 
 def rms_table(before: LeftOutRows, after: LeftOutRows, fitted: Fitted) -> pd.DataFrame:

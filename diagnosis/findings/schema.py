@@ -59,7 +59,7 @@ class When(_Part):
     windows: tuple[tuple[str, float, float], ...] = ()
 
 
-class FoundParameter(_Part):
+class FittedParameter(_Part):
     """A fitted value in its unit; no interval where it was not freed."""
 
     value: Number
@@ -83,7 +83,7 @@ class Finding(_Part):
     mechanism: str
     where: Place
     when: When = When()
-    parameters: Mapping[str, FoundParameter] = {}
+    parameters: Mapping[str, FittedParameter] = {}
     probability: Share
     alternatives: tuple[Alternative, ...] = ()
     equation: str = ""

@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from data.units import unit_label
 from diagnosis.contracts import CandidateKind, Where
 from diagnosis.findings.report_data import (
+    Effect,
     Estimate,
-    Found,
     Other,
     Rms,
     amount,
@@ -25,7 +25,7 @@ from diagnosis.findings.report_data import (
     times_noise,
     with_unit,
 )
-from diagnosis.findings.schema import Alternative, DetectionLimit, Finding, FoundParameter, Place, Verdict, When
+from diagnosis.findings.schema import Alternative, DetectionLimit, Finding, FittedParameter, Place, Verdict, When
 from diagnosis.policy import POLICY
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Mechanism
@@ -65,97 +65,96 @@ _THINGS = {"sensor": "sensor|channel", "error": "channel", "link": "joint|link",
 _MAX_NAMED = 3  # limits, alternatives and parameters that a sentence names
 
 
-def finding_of(found: Found) -> Finding:
+def build_finding(effect: Effect) -> Finding:
     """The entry of findings.json, with its sentence, its equation with numbers, and its errors as evidence."""
-    values = {p: e.value for p, e in found.parameters.items()}
+    values = {p: e.value for p, e in effect.parameters.items()}
     figures = {"before": "before", "after": "after", "noise_floor": "noise"}
-    rms = {key: {r.key: getattr(r, own) for r in found.rms} for key, own in figures.items()}
+    rms = {key: {r.key: getattr(r, own) for r in effect.rms} for key, own in figures.items()}
     return Finding(
-        mechanism=found.mechanism,
-        where=_place(found.where),
-        when=When(regime=found.regime, windows=found.windows),
+        mechanism=effect.mechanism,
+        where=_place(effect.where),
+        when=When(regime=effect.regime, windows=effect.windows),
         parameters={
-            p: FoundParameter(value=e.value, unit=e.unit, interval90=(e.low, e.high) if e.known else None)
-            for p, e in found.parameters.items()
+            p: FittedParameter(value=e.value, unit=e.unit, interval90=(e.low, e.high) if e.known else None)
+            for p, e in effect.parameters.items()
         },
-        probability=found.probability,
+        probability=effect.probability,
         alternatives=tuple(
             Alternative(
                 mechanism=o.mechanism, where=_place(o.where), probability=o.probability, alike=o.indistinguishable
             )
-            for o in found.others
+            for o in effect.others
         ),
-        equation=equation_with_numbers(MECHANISMS[found.mechanism], values) if found.mechanism in MECHANISMS else "",
-        statement=statement(found),
-        evidence={**({"left_out_rms": rms} if found.rms else {}), **found.evidence},
-        name=found.name or None,
+        equation=equation_with_numbers(MECHANISMS[effect.mechanism], values) if effect.mechanism in MECHANISMS else "",
+        statement=statement(effect),
+        evidence={**({"left_out_rms": rms} if effect.rms else {}), **effect.evidence},
+        name=effect.name or None,
     )
 
 
-def statement(found: Found) -> str:
+def statement(effect: Effect) -> str:
     """Claim, evidence, advice and caveat of one effect, as a few short sentences on one line."""
-    claim = claim_phrase(found)
-    fall = falls(found.rms)
-    if fall:
-        claim += f"; with it {fall}"
-        better, of = found.evidence.get("batches_improved"), found.evidence.get("batches")
+    claim = claim_phrase(effect)
+    reduced = reductions(effect.rms)
+    if reduced:
+        claim += f"; with it {reduced}"
+        better, of = effect.evidence.get("batches_improved"), effect.evidence.get("batches")
         claim += f", more probable in {better} of {of} runs" if better is not None and of else ""
     return " ".join(
         [
             f"{claim}.",
-            *_others(found),
-            *_advice(found),
-            *([f"No surer than that: {listed(found.caps)}."] if found.caps else []),
+            *_others(effect),
+            *_advice(effect),
+            *([f"No surer than that: {listed(effect.caps)}."] if effect.caps else []),
         ]
     )
 
 
-def claim_phrase(found: Found) -> str:
+def claim_phrase(effect: Effect) -> str:
     """What is missing, where and how much, without a full stop; the first letter is a capital."""
-    if found.tied:
+    if effect.tied:
         # what is claimed may be the less likely: a likelier, indistinguishable one may fail a criterion
         own = (
-            found.separate_probability,
-            f"{effect_phrase(found)}{_size(found)} ({percent(found.separate_probability)})",
+            effect.separate_probability,
+            f"{effect_phrase(effect)}{_size(effect)} ({percent(effect.separate_probability)})",
         )
-        tied = [(o.probability, f"{_other_phrase(o)} ({percent(o.probability)})") for o in found.tied]
-        said = [text for _, text in sorted([own, *tied], key=lambda s: -s[0])]
-        numbers = {2: "two", 3: "three", 4: "four"}
-        return (
-            f"These runs cannot distinguish {numbers.get(len(said), str(len(said)))} explanations: {listed(said, 'or')}"
-        )
-    hedge = _hedge(found.probability)
-    sentence = _sentence(found)
+        tied = [(o.probability, f"{_other_phrase(o)} ({percent(o.probability)})") for o in effect.tied]
+        phrases = [text for _, text in sorted([own, *tied], key=lambda s: -s[0])]
+        n = len(phrases)
+        number = {2: "two", 3: "three", 4: "four"}.get(n, str(n))
+        return f"These runs cannot distinguish {number} explanations: {listed(phrases, 'or')}"
+    hedge = _hedge(effect.probability)
+    sentence = _sentence(effect)
     if sentence:
         return _capital(f"{hedge} {sentence}".strip())
-    if found.kind.is_unlisted:
-        return _capital(f"{hedge} {effect_phrase(found)}; no listed mechanism does this".strip())
-    frame = "in the measurement" if MECHANISMS[found.mechanism].fault else "missing"
-    return f"{_capital(f'{hedge} {frame}'.strip())}: {effect_phrase(found)}{_size(found)}"
+    if effect.kind.is_unlisted:
+        return _capital(f"{hedge} {effect_phrase(effect)}; no listed mechanism does this".strip())
+    frame = "in the measurement" if MECHANISMS[effect.mechanism].fault else "missing"
+    return f"{_capital(f'{hedge} {frame}'.strip())}: {effect_phrase(effect)}{_size(effect)}"
 
 
-def effect_phrase(found: Found) -> str:
+def effect_phrase(effect: Effect) -> str:
     """``heat to the floor at the bed``, and when; what has no listed mechanism by its size: ``60 W into the bed``."""
-    if found.kind.is_unlisted:
-        return f"{_size(found).removeprefix(', ')} {_inward(found)}{_in_brackets(found.context)}{_when(found)}"
-    return _noun(found.mechanism, found.where, found.place, found.context) + _when(found)
+    if effect.kind.is_unlisted:
+        return f"{_size(effect).removeprefix(', ')} {_inward(effect)}{_in_brackets(effect.context)}{_when(effect)}"
+    return _noun(effect.mechanism, effect.where, effect.place, effect.context) + _when(effect)
 
 
-def falls(rms: Sequence[Rms], most: int = 2) -> str:
-    """How far the errors of the runs left out fall, the greatest fall first, and which ones rise; nothing where none
-    falls."""
+def reductions(rms: Sequence[Rms], most: int = 2) -> str:
+    """By how much the errors of the runs left out fall, the greatest reduction first, and which ones rise; empty where
+    none falls."""
     rms = [r for r in rms if few(r.before) != few(r.after)]
     fallen = [r for r in rms if r.after < POLICY.reduced_max_share * r.before]
     fallen = sorted(fallen, key=lambda r: (r.after / r.before, r.channel))[:most]
     risen = [r for r in rms if r.before < POLICY.reduced_max_share * r.after and not r.after <= r.noise]
     risen = sorted(risen, key=lambda r: (-r.after / r.before, r.channel))[:most]
-    said = []
+    phrases = []
     for k, r in enumerate(fallen):
         of = " of runs left out of the fit" if k == 0 else ""
         noise = f" (noise {few(r.noise)})" if r.noise > 0 else ""
-        said.append(f"{_error_of(r)}{of} falls from {few(r.before)} to {of_error(r.after, r.unit)}{noise}")
+        phrases.append(f"{_error_of(r)}{of} falls from {few(r.before)} to {of_error(r.after, r.unit)}{noise}")
     worse = listed([f"{_error_of(r)} rises from {few(r.before)} to {of_error(r.after, r.unit)}" for r in risen])
-    return f"{listed(said)}{f', while {worse}' if worse and said else ''}"
+    return f"{listed(phrases)}{f', while {worse}' if worse and phrases else ''}"
 
 
 def _error_of(r: Rms) -> str:
@@ -164,7 +163,7 @@ def _error_of(r: Rms) -> str:
 
 def verdict_statement(
     verdict: Verdict,
-    found: Sequence[Found] = (),
+    effects: Sequence[Effect] = (),
     rms: Sequence[Rms] = (),
     limits: Sequence[DetectionLimit] = (),
     separates: str = "",
@@ -178,36 +177,36 @@ def verdict_statement(
         separates: the run that would distinguish the explanations `possible`, or show whether they hold.
     """
     # of several effects each says by itself how sure it is, and what may be in its place
-    doubts = [_doubt(f) if len(found) > 1 else _instead(f) for f in found]
-    said = listed(
+    doubts = [_doubt(f) if len(effects) > 1 else _instead(f) for f in effects]
+    named = listed(
         [
             effect_phrase(f) + ("" if f.kind.is_unlisted else _size(f)) + doubt
-            for f, doubt in zip(found, doubts, strict=True)
+            for f, doubt in zip(effects, doubts, strict=True)
         ]
     )
-    hedge = _hedge(found[0].probability) if len(found) == 1 else ""
-    fall = falls(rms)
+    hedge = _hedge(effects[0].probability) if len(effects) == 1 else ""
+    reduced = reductions(rms)
     if verdict == "consistent":
         return _consistent(rms, limits, places) + _open_question(separates, possible)
     if verdict == "undecidable":
-        tied = found and found[0].tied
+        tied = effects and effects[0].tied
         text = "Something is missing." if tied else "Something is missing, and these runs do not show what."
-        text += f" {claim_phrase(found[0])}." if found else ""
+        text += f" {claim_phrase(effects[0])}." if effects else ""
         if not tied:
             return text + _open_question(separates, possible)
         return text + (f" {_capital(separates)} would decide." if separates else "")
     if verdict == "unlisted":
         text = "No listed mechanism explains the difference"
-        return f"{text}: {said}{f'; with it {fall}' if fall else ''}."
+        return f"{text}: {named}{f'; with it {reduced}' if reduced else ''}."
     if verdict == "partly_explained":
-        text = _capital(f"{hedge} part of the difference is {said}".strip())
+        text = _capital(f"{hedge} part of the difference is {named}".strip())
         still = [f"{r.channel} still at {few(r.times_noise)} times its noise" for r in beyond_noise(rms)[:_MAX_NAMED]]
-        more = f"{text}{f'; with it {fall}' if fall else ''}. Not explained: {listed(still) or 'what remains'}."
+        more = f"{text}{f'; with it {reduced}' if reduced else ''}. Not explained: {listed(still) or 'what remains'}."
         return more + _open_question(separates, possible)
-    text = _capital(f"{hedge} the difference is {said}".strip())
-    them = "it" if len(found) == 1 else "them"
+    text = _capital(f"{hedge} the difference is {named}".strip())
+    them = "it" if len(effects) == 1 else "them"
     noise_alone = f"With {them} every channel is within {few(POLICY.noise_max_ratio)} times its noise on runs left out"
-    return f"{text}{f'; with it {fall}' if fall else ''}. {noise_alone}."
+    return f"{text}{f'; with it {reduced}' if reduced else ''}. {noise_alone}."
 
 
 def _open_question(run: str, possible: Sequence[str]) -> str:
@@ -239,19 +238,19 @@ def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Se
     return f"{text}. An effect above these limits would be claimed: {', '.join(seen)}{more}." if seen else f"{text}."
 
 
-def _sentence(found: Found) -> str:
+def _sentence(effect: Effect) -> str:
     """The claim where it is a sentence by itself: alternatives, and summaries such as "sensor that drifts"."""
-    if found.kind is CandidateKind.WRONG_PARAMETER:
-        said = _few([_replaced(p, found.was.get(p), found.parameters[p]) for p in found.parameters])
-        several = len(said) > 1
-        return f"the value{'s' * several} of {listed(said)} in the machine file {'are' if several else 'is'} wrong"
-    if found.mechanism not in MECHANISMS or found.kind.is_unlisted:
+    if effect.kind is CandidateKind.WRONG_PARAMETER:
+        phrases = _few([_replaced(p, effect.was.get(p), effect.parameters[p]) for p in effect.parameters])
+        several = len(phrases) > 1
+        return f"the value{'s' * several} of {listed(phrases)} in the machine file {'are' if several else 'is'} wrong"
+    if effect.mechanism not in MECHANISMS or effect.kind.is_unlisted:
         return ""
-    thing = re.match(rf"({_THINGS[found.where.kind]}) that (.+)", MECHANISMS[found.mechanism].summary)
+    thing = re.match(rf"({_THINGS[effect.where.kind]}) that (.+)", MECHANISMS[effect.mechanism].summary)
     if not thing:
         return ""
-    place = f" between {found.place}" if found.where.kind == "link" else f" {found.place}"
-    return f"the {thing[1]}{place} {thing[2]}{_in_brackets(found.context)}{_when(found)}{_size(found)}"
+    place = f" between {effect.place}" if effect.where.kind == "link" else f" {effect.place}"
+    return f"the {thing[1]}{place} {thing[2]}{_in_brackets(effect.context)}{_when(effect)}{_size(effect)}"
 
 
 def _noun(key: str, where: Where, place: str, context: str = "") -> str:
@@ -281,62 +280,62 @@ def _at(where: Where, place: str) -> str:
             "sensor": f"of the sensor {place}"}[where.kind]  # fmt: skip
 
 
-def _inward(found: Found) -> str:
+def _inward(effect: Effect) -> str:
     """Where what is not listed goes."""
-    return {"node": f"into {found.place}", "link": f"between {found.place}", "error": f"in the {found.place} error",
-            "sensor": f"in what the sensor {found.place} shows"}[found.where.kind]  # fmt: skip
+    return {"node": f"into {effect.place}", "link": f"between {effect.place}", "error": f"in the {effect.place} error",
+            "sensor": f"in what the sensor {effect.place} shows"}[effect.where.kind]  # fmt: skip
 
 
-def _size(found: Found) -> str:
+def _size(effect: Effect) -> str:
     """``, 10 W/K (90 %: 9–12)``; a bare number, or one of several, with its parameter's name."""
-    if found.size is not None:
-        return f", {amount(found.size)}"
-    named = len(found.main) > 1 or any(not unit_label(found.parameters[p].unit) for p in found.main)
-    said = [f"{p.replace('_', ' ')} " * named + amount(found.parameters[p]) for p in found.main]
-    return f", {listed(_few(said))}" if said else ""
+    if effect.size is not None:
+        return f", {amount(effect.size)}"
+    named = len(effect.main) > 1 or any(not unit_label(effect.parameters[p].unit) for p in effect.main)
+    phrases = [f"{p.replace('_', ' ')} " * named + amount(effect.parameters[p]) for p in effect.main]
+    return f", {listed(_few(phrases))}" if phrases else ""
 
 
-def _few(said: list[str]) -> list[str]:
+def _few(phrases: list[str]) -> list[str]:
     """What a sentence names of several parameters; all stand in `findings.json`."""
-    more = len(said) - _MAX_NAMED
-    return said if more < 1 else [*said[:_MAX_NAMED], f"{more} more"]
+    more = len(phrases) - _MAX_NAMED
+    return phrases if more < 1 else [*phrases[:_MAX_NAMED], f"{more} more"]
 
 
 def _replaced(path: str, was: float | None, now: Estimate) -> str:
     return f"{path} ({'' if was is None else with_unit(as_given(was), now.unit) + ' → '}{amount(now)})"
 
 
-def _others(found: Found) -> list[str]:
+def _others(effect: Effect) -> list[str]:
     """What would look the same, and the run that would distinguish them; what is less likely is not named."""
-    same = [o for o in found.others if o.indistinguishable and o not in found.tied][:_MAX_NAMED]
+    same = [o for o in effect.others if o.indistinguishable and o not in effect.tied][:_MAX_NAMED]
     if not same:
-        return [f"{_capital(found.separates)} would distinguish them."] if found.tied and found.separates else []
-    said = listed([f"{_other_phrase(o)} ({percent(o.probability)})" for o in same])
-    run = f"; {found.separates} would distinguish them" if found.separates else ""
-    return [f"{_capital(said)} would look the same in these runs{run}."]
+        return [f"{_capital(effect.separates)} would distinguish them."] if effect.tied and effect.separates else []
+    named = listed([f"{_other_phrase(o)} ({percent(o.probability)})" for o in same])
+    run = f"; {effect.separates} would distinguish them" if effect.separates else ""
+    return [f"{_capital(named)} would look the same in these runs{run}."]
 
 
-def _doubt(found: Found) -> str:
+def _doubt(effect: Effect) -> str:
     """`` (41 %; or radiation at the bed, 52 %)``: of one effect among several; nothing where it is sure."""
-    if found.probability > POLICY.plain_probability:
+    if effect.probability > POLICY.plain_probability:
         return ""
-    tied = [f"{_other_phrase(o)}, {percent(o.probability)}" for o in found.tied]
-    return f" ({percent(found.probability)}{''.join(f'; or {text}' for text in tied)})"
+    tied = [f"{_other_phrase(o)}, {percent(o.probability)}" for o in effect.tied]
+    return f" ({percent(effect.probability)}{''.join(f'; or {text}' for text in tied)})"
 
 
-def _instead(found: Found) -> str:
+def _instead(effect: Effect) -> str:
     """``, or radiation at the bed``: what these runs cannot distinguish from an effect."""
-    return f", or {listed([_other_phrase(o) for o in found.tied], 'or')}" if found.tied else ""
+    return f", or {listed([_other_phrase(o) for o in effect.tied], 'or')}" if effect.tied else ""
 
 
 def _other_phrase(other: Other) -> str:
     return _noun(other.mechanism, other.where, other.place, other.context)
 
 
-def _advice(found: Found) -> list[str]:
-    if found.mechanism in MECHANISMS and MECHANISMS[found.mechanism].fault:
+def _advice(effect: Effect) -> list[str]:
+    if effect.mechanism in MECHANISMS and MECHANISMS[effect.mechanism].fault:
         return ["Check it at the machine before the model is changed."]
-    if found.kind is CandidateKind.WRONG_PARAMETER:
+    if effect.kind is CandidateKind.WRONG_PARAMETER:
         return ["Check the value against the drawing or the data sheet."]
     return []
 
@@ -347,8 +346,8 @@ def _hedge(probability: float) -> str:
     return f"{'most likely' if probability >= POLICY.likely_probability else 'perhaps'} ({percent(probability)})"
 
 
-def _when(found: Found) -> str:
-    return "" if found.regime in ("", "always") else f" (when: {found.regime})"
+def _when(effect: Effect) -> str:
+    return "" if effect.regime in ("", "always") else f" (when: {effect.regime})"
 
 
 def _in_brackets(context: str) -> str:

@@ -18,9 +18,9 @@ from twin.simulation.inputs import acting, inputs_of
 
 
 def enough_batches(batches: Sequence[Batch]) -> tuple[list[Batch], tuple[str, ...]]:
-    """The batches, or, of fewer than four, blocks of them in time; and what is to be said of that.
+    """The batches, or, of fewer than four, blocks of them in time; and remarks on that.
 
-    A block starts where its sensors stand: bodies without one start as the network at rest says, within the prior.
+    A block starts at its first readings; bodies without a sensor start as the network at rest, within the prior.
     """
     if len(batches) >= POLICY.min_batches:
         return list(batches), ()

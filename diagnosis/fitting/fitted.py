@@ -71,7 +71,7 @@ def baseline(
     """The twin part fitted to all batches, under the covariance of what refined twins about that fit show.
 
     All fits are to `coarse` rows, so that their cost does not depend on how often a machine is recorded. Refined twins
-    are drawn twice: about a first calibration, and about the fit under what those say.
+    are drawn twice: about a first calibration, and about the fit under their covariance.
 
     Args:
         runs: the number of runs, where batches are blocks of fewer.
@@ -83,17 +83,17 @@ def baseline(
         WorkError: the model fails at the priors' means, or no refined twin can be simulated.
     """
     check(machine, batches)
-    tell, runs = progress or (lambda step, n, of: None), runs or len(batches)
-    tell("baseline", 1, 3)
+    report, runs = progress or (lambda step, n, of: None), runs or len(batches)
+    report("baseline", 1, 3)
     at = _calibrated_first(machine, part, batches, lead_rows)
     problem = at.problem
     first = POLICY.refined_twins // 2
-    drawn = _structure(at, first, seed, tell)
+    drawn = _structure(at, first, seed, report)
     covariance = rough(problem, [POLICY.rough_structure_factor / np.sqrt(first) * d for d in drawn])
-    tell("baseline", 2, 3)
+    report("baseline", 2, 3)
     at = _fitted(_begun(at, covariance, Hyper(), runs))
-    tell("baseline", 3, 3)
-    return structured(at, runs, seed, tell)
+    report("baseline", 3, 3)
+    return structured(at, runs, seed, report)
 
 
 def lead_of(machine: Machine, part: TwinPart, batches: Sequence[Batch]) -> float:
@@ -125,14 +125,16 @@ def _calibrated_first(
     return Point(machine, part, own, problem, state.z, state.nuisance, lead_rows)
 
 
-def structured(at: Point, runs: int, seed: int = 0, tell: Callable[[str, int, int], None] = lambda *_: None) -> Fitted:
+def structured(
+    at: Point, runs: int, seed: int = 0, report: Callable[[str, int, int], None] = lambda *_: None
+) -> Fitted:
     """The fit under the covariance of what refined twins about it show, with all effects that it holds.
 
     Raises:
         WorkError: no refined twin can be simulated.
     """
     problem = at.problem
-    drawn = _structure(at, POLICY.refined_twins, seed, tell)
+    drawn = _structure(at, POLICY.refined_twins, seed, report)
     blocks = list(problem.linearise(at.x, at.nuisance))
     known = orthogonal_to_parameters(blocks, _spread(problem.unknowns), imperfections(at))
     structure = Structure(drawn, known, white_noise(problem))
@@ -213,7 +215,7 @@ def _learned(begun: Fitted) -> Fitted:
     return fitted
 
 
-def _structure(at: Point, draws: int, seed: int, tell: Callable[[str, int, int], None]) -> list[Array]:
+def _structure(at: Point, draws: int, seed: int, report: Callable[[str, int, int], None]) -> list[Array]:
     """Misfits of refined twins (n_b, draws), orthogonal to the parameters.
 
     A fit that lacks an effect can have values that no machine has, about which few twins can be simulated: they are
@@ -221,7 +223,7 @@ def _structure(at: Point, draws: int, seed: int, tell: Callable[[str, int, int],
     """
 
     def progress(n: int, of: int) -> None:
-        tell("refined twins", n, of)
+        report("refined twins", n, of)
 
     def about(at: Point) -> list[Array]:
         drawn = drawn_misfits(at.machine, at.part, at.batches, at.problem, at.values, draws, seed, progress)

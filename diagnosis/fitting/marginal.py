@@ -126,7 +126,7 @@ class Marginal:
         return Many(mixed, along, own, np.sum([np.einsum("nc,nc->c", y, y) for y in others], axis=0))
 
     def level(self, hyper: Hyper) -> Level:
-        """All of it at these hyperparameters; kept, since every hypothesis of a round asks for the same few."""
+        """All of it at these hyperparameters; cached, since all hypotheses of a round need the same few."""
         if hyper not in self._levels:
             self._levels[hyper] = Level(self, hyper)
         return self._levels[hyper]

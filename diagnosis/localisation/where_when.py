@@ -143,7 +143,7 @@ RANKING = ("rank", "kind", "place", "gain", "evidence", "probability", "sigma", 
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundPlace:
     """A place that explains what the others leave; `odds` are of nothing and of each kind with the others held.
 
     `gain` in nats over leaving it out, `sigma` its amplitude in `unit`; `series` holds mean and sd (B, K) at the hats.
@@ -169,7 +169,7 @@ class Located:
 
     point: Point
     held: tuple[Held, ...]
-    found: tuple[Found, ...]
+    found: tuple[FoundPlace, ...]
     ranking: pd.DataFrame
     map: pd.DataFrame
 
@@ -217,20 +217,20 @@ def locate(
         InputError: batches that are not the problem's.
         WorkError: the simulation fails at the fit.
     """
-    say = progress or (lambda what, done, of: None)
+    report = progress or (lambda what, done, of: None)
     _check(problem, batches)
     hats = Hats.over(float(_ends_s(problem).max()))
     point = Point.of(problem, x, nuisance, hats, Noise.as_given(len(problem.channels)))
     held = point.search.forward(most)
     for number in range(POLICY.linearisations):
-        say("locate", number, POLICY.linearisations)
+        report("locate", number, POLICY.linearisations)
         point = point.moved(held)
         held = point.search.forward(most)
         if point.converged:
             break
     found = tuple(_found(point.search, held, k) for k in range(len(held)))
     table = _map(point.search, held, regimes_of(batches), [b.time_s for b in batches])
-    say("locate", POLICY.linearisations, POLICY.linearisations)
+    report("locate", POLICY.linearisations, POLICY.linearisations)
     return Located(point, tuple(held), found, _ranking(point.search), table)
 
 
@@ -253,11 +253,11 @@ def _odds(search: PlaceSearch, held: Sequence[Held]) -> dict[str, float]:
     return {"nothing": max(0.0, 1.0 - sum(each.values()))} | each
 
 
-def _found(search: PlaceSearch, held: Sequence[Held], k: int) -> Found:
+def _found(search: PlaceSearch, held: Sequence[Held], k: int) -> FoundPlace:
     others, own = [h for h in held if h is not held[k]], held[k]
     basis, series = search.bases[own.basis], search.series(others)[own.basis]
     sigma, gain = float(series.best.sigma[own.place]), float(series.best.gain[own.place])
-    return Found(
+    return FoundPlace(
         basis.kind, basis.places[own.place], basis.units[own.place], gain, sigma, _odds(search, others),
         series.posterior(own.place),
     )  # fmt: skip

@@ -164,8 +164,8 @@ class _Shop:
         yield self._run(f"{self._span(4)} at {self._level(name, low)}", [(4.0, {name: low})])
 
     def alone(self, name: str) -> Run:
-        said = "the feed" if quantity(self.machine.channels[name].unit) == "feed" else name
-        label = f"{said} alone, {self._span(3)} {self._working(name)} and {self._span(1)} off"
+        subject = "the feed" if quantity(self.machine.channels[name].unit) == "feed" else name
+        label = f"{subject} alone, {self._span(3)} {self._working(name)} and {self._span(1)} off"
         return self._run(label, [(3.0, {name: self.highest[name]}), (1.0, {name: 0.0})])
 
     def cooling(self, name: str) -> Run:

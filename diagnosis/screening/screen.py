@@ -1,4 +1,4 @@
-"""The screen: what every candidate gains by its signature, with all that is not asked integrated out."""
+"""The screen: the gain of every candidate by its signature, all nuisances integrated out."""
 
 from __future__ import annotations
 

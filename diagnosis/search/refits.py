@@ -73,13 +73,13 @@ def ranked_paths(now: Fitted, seen: Screen, cold: set[str]) -> list[Scored]:
 
 
 def refits(
-    now: Fitted, seen: Screen, work: Sequence[Scored], odds: dict[str, float], workers: Processes, tell: Progress
+    now: Fitted, seen: Screen, work: Sequence[Scored], odds: dict[str, float], workers: Processes, report: Progress
 ) -> list[Tried]:
     """Those that can be simulated, the likeliest first."""
     clusters, sizes = _clusters(now, seen, work), slack([s.candidate for s in work], now)
     out = []
     for n, (s, fitted) in enumerate(zip(work, workers.map(partial(refit, now), work), strict=True)):
-        tell("refit", n + 1, len(work))
+        report("refit", n + 1, len(work))
         if fitted is not None and not _usual(s.candidate, fitted, sizes):
             c = s.candidate
             gain = fitted.log_evidence - now.log_evidence

@@ -38,29 +38,29 @@ class Search:
 def search(baseline: Fitted, workers: Processes | None = None, progress: Progress | None = None) -> Search:
     """Effects are claimed one after the other; then each is judged, or replaced, with all others in the model: two
     effects may each be hidden by the other."""
-    tell, workers = progress or (lambda step, n, of: None), workers or Processes()
+    report, workers = progress or (lambda step, n, of: None), workers or Processes()
     rounds: list[Round] = []
     now = baseline
     while len(rounds) < POLICY.max_effects:
-        rounds.append(one_round(now, workers, tell, rounds[-1].screen if rounds else None))
+        rounds.append(one_round(now, workers, report, rounds[-1].screen if rounds else None))
         best = rounds[-1].best
         if best is None or not rounds[-1].accepted:
             break
         now = best.fitted
     first = rounds[0].before
-    rounds, final = _judged_together(first, rounds, workers, tell)
+    rounds, final = _judged_together(first, rounds, workers, report)
     return Search(first, final, tuple(rounds))
 
 
 def _judged_together(
-    baseline: Fitted, rounds: list[Round], workers: Processes, tell: Progress
+    baseline: Fitted, rounds: list[Round], workers: Processes, report: Progress
 ) -> tuple[list[Round], Fitted]:
     """The rounds, each with all other effects in its fit before, and the fit with those that are accepted."""
     claimed = [k for k, r in enumerate(rounds) if r.accepted]
     full = rounds[claimed[-1]].best.fitted if claimed else baseline  # type: ignore[union-attr]
     for k in claimed[:-1]:
         try:
-            done = one_round(less(full, rounds[k], baseline), workers, tell, rounds[k].screen)
+            done = one_round(less(full, rounds[k], baseline), workers, report, rounds[k].screen)
         except (InputError, WorkError):
             continue  # no machine is without it
         if done.best is not None and done.best.fitted.log_evidence < full.log_evidence - POLICY.negligible_nats:
@@ -88,11 +88,11 @@ def less(fitted: Fitted, done: Round, baseline: Fitted) -> Fitted:
 
 
 def one_round(
-    now: Fitted, workers: Processes, tell: Progress, before: Screen | None = None, listed: bool = True
+    now: Fitted, workers: Processes, report: Progress, before: Screen | None = None, listed: bool = True
 ) -> Round:
     """What one effect more would explain, the likeliest first; free forms stand in for what no list names, alone if not
     `listed`."""
-    tell("screen", 0, 0)
+    report("screen", 0, 0)
     forms = _forms(now)
     plain = [c for c, f in forms.values() if f.plain]
     seen = screen(now, [*(proposed(now) if listed else ()), *plain], before)
@@ -100,7 +100,7 @@ def one_round(
     more = [c for c, f in forms.values() if not f.plain and f.where in places]
     seen = screen(now, [*(s.candidate for s in seen.scored), *more], seen)
     odds = odds_of(now, seen)
-    tried = refits(now, seen, shortlist(now, seen, odds), odds, workers, tell)
+    tried = refits(now, seen, shortlist(now, seen, odds), odds, workers, report)
     known = {n: f for n, (_, f) in forms.items()}
     return decided(Round(now, seen, tuple(tried), forms=known))
 

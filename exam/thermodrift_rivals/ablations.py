@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 from data.processes import Processes
 from diagnosis.contracts import Candidate, Fitted, Where
-from diagnosis.findings.conclude import claimed, rms_of, slow_residual_ratio, verdict_of
-from diagnosis.findings.report_data import Found, rms_table
+from diagnosis.findings.conclude import claimed_effect, rms_of, slow_residual_ratio, verdict_of
+from diagnosis.findings.report_data import Effect, rms_table
 from diagnosis.findings.schema import Findings, Verdict
 from diagnosis.fitting.covariance import independent, white_noise
 from diagnosis.fitting.fitted import left_out_rows, under
@@ -33,7 +33,7 @@ class Stage:
         if not done.accepted or done.best is None:
             return Reply(_verdict([], done.before, policy))
         best, fitted = done.best.candidate, done.best.fitted
-        found = claimed(done, fitted.part, fitted)
+        found = claimed_effect(done, fitted.part, fitted)
         every = [(e.tried.candidate, e.probability) for e in explanations(done)[0]]
         others = [(c, p) for c, p in every if (c.mechanism, c.where) != (best.mechanism, best.where)]
         own = sum(p for _, p in every) - sum(p for _, p in others)
@@ -41,7 +41,7 @@ class Stage:
         return Reply(_verdict([found], fitted, policy), (Claim(best, found.probability, alike),))
 
 
-def _verdict(found: list[Found], fitted: Fitted, policy: Policy) -> Verdict:
+def _verdict(found: list[Effect], fitted: Fitted, policy: Policy) -> Verdict:
     left = left_out_rows(fitted)
     rms = rms_of(rms_table(left, left, fitted), fitted)
     listed = [f for f in found if not f.kind.is_unlisted]

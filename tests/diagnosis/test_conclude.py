@@ -20,7 +20,7 @@ from diagnosis.findings.conclude import (
     slow_residual_ratio,
     verdict_of,
 )
-from diagnosis.findings.report_data import Found, Rms
+from diagnosis.findings.report_data import Effect, Rms
 from diagnosis.fitting.fitted import refitted
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import proposed
@@ -81,7 +81,7 @@ def test_where_nothing_is_found_and_much_is_left_nothing_is_decided(slow: float,
 
 @pytest.mark.parametrize(("after", "verdict"), [(1.4, "explained"), (1.6, "partly_explained")])
 def test_what_was_found_explains_the_difference_where_it_leaves_noise_alone(after: float, verdict: str) -> None:
-    sink = Found("floor_sink", Where("node", "bed"), "the bed", {}, 0.95)
+    sink = Effect("floor_sink", Where("node", "bed"), "the bed", {}, 0.95)
     rms = (Rms("z", "um", 9.0, 1.0, 1.0), Rms("t_rear", "K", 9.0, 0.1 * after, 0.1, sensor=True))
     assert verdict_of([sink], False, rms, 0.0, 12) == verdict
     assert verdict_of([sink], True, rms, 0.0, 12) == "partly_explained"

@@ -16,8 +16,8 @@ import pytest
 from data.machine import load_machine
 from diagnosis.contracts import Kind, Where
 from diagnosis.findings.report_data import (
+    Effect,
     Estimate,
-    Found,
     Other,
     Rms,
     amount,
@@ -29,10 +29,10 @@ from diagnosis.findings.report_data import (
 )
 from diagnosis.findings.schema import DetectionLimit, Place
 from diagnosis.findings.statement import (
+    build_finding,
     claim_phrase,
     equation_with_numbers,
-    falls,
-    finding_of,
+    reductions,
     statement,
     verdict_statement,
 )
@@ -43,7 +43,7 @@ from twin.schema import MechanismPart, twin_part
 
 BED = Where("node", "bed")
 Z = Rms("z", "um", 9.1, 1.4, 1.2)
-SINK = Found(
+SINK = Effect(
     "floor_sink", BED, "the bed", {"conductance": Estimate(10.2, "W/K", 8.9, 11.6)}, 0.92, name="floor_sink_bed",
     others=(Other("radiation", BED, "the bed", 0.08),), rms=(Z,), separates="a night switched off",
     evidence={"batches_improved": 11, "batches": 12, "gain_nats": 41.0},
@@ -55,9 +55,9 @@ KIND: dict[Target, Kind] = {
 PLACE: dict[Kind, str] = {"node": "the bed", "link": "the bed and the room", "sensor": "head_rear", "error": "z"}
 
 
-def found(mechanism: str, kind: Kind, value: float = 0.12, unit: str = "K/h", probability: float = 0.95) -> Found:
+def found(mechanism: str, kind: Kind, value: float = 0.12, unit: str = "K/h", probability: float = 0.95) -> Effect:
     parameters = {MECHANISMS[mechanism].parameters[0].name: Estimate(value, unit, 0.9 * value, 1.1 * value)}
-    return Found(mechanism, Where(kind, PLACE[kind]), PLACE[kind], parameters, probability)
+    return Effect(mechanism, Where(kind, PLACE[kind]), PLACE[kind], parameters, probability)
 
 
 def test_claim_evidence_advice_and_caveat() -> None:
@@ -109,27 +109,28 @@ def test_a_tie_is_said_as_one() -> None:
         (found("sensor_bonding", "sensor", 0.8, "1"),
          "In the measurement: poorly bonded sensor head_rear, bonding 0.80 (90 %: 0.72–0.88)"),
         (found("sensor_place", "sensor", 0.12, "1"), "In the measurement: the sensor head_rear off its body's mean"),
-        (Found("sensor_swap", Where("sensor", "front"), "front", {}, 0.95, context="with: rear"),
+        (Effect("sensor_swap", Where("sensor", "front"), "front", {}, 0.95, context="with: rear"),
          "In the measurement: two sensors exchanged: front (with: rear)."),
         (found("time_skew", "error", 120.0, "s"), "clock of the channel z against the others, 120 s (90 %: 110–130)"),
         (found("joint_conductance", "link", 0.4, "1", 0.7),
          "Most likely (70 %) the joint between the bed and the room conducts better or worse than assumed, ratio 0.40"),
         (found("speed_shift", "error", -4.0, "um"), "axial shift of the shaft with the speed in the z error, −4.0 µm"),
         (replace(found("cabinet_heat", "node", 60.0, "W"), regime="coolant on"), "at the bed (when: coolant on), 60 W"),
-        (Found("motor_loss", BED, "the bed", {"idle": Estimate(40, "W", 30, 50), "linear": Estimate(110, "W", 90, 130)},
+        (Effect("motor_loss", BED, "the bed",
+          {"idle": Estimate(40, "W", 30, 50), "linear": Estimate(110, "W", 90, 130)},
                0.99), "motor at the bed, idle 40 W (90 %: 30–50) and linear 110 W (90 %: 90–130)."),
-        (Found("wrong_parameter", Where("link", "front-air"), "", {"exposures.front-air.conductance":
+        (Effect("wrong_parameter", Where("link", "front-air"), "", {"exposures.front-air.conductance":
                Estimate(4.2, "W/K", 3.6, 4.9)}, 0.95, was={"exposures.front-air.conductance": 1.0}),
          "The value of exposures.front-air.conductance (1 W/K → 4.2 W/K (90 %: 3.6–4.9)) in the machine file is wrong. "
          "Check the value against the drawing or the data sheet."),
-        (Found("free_flux", Where("node", "column_back"), "the column back", {"linear": Estimate(0.01, "W")}, 0.95,
+        (Effect("free_flux", Where("node", "column_back"), "the column back", {"linear": Estimate(0.01, "W")}, 0.95,
                regime="coolant on", size=Estimate(58, "W", 49, 66)),
          "58 W (90 %: 49–66) into the column back (when: coolant on); no listed mechanism does this."),
-        (Found("free_shift", Where("error", "z"), "z", {"linear": Estimate(3.0, "um", 2.0, 4.0)}, 0.5),
+        (Effect("free_shift", Where("error", "z"), "z", {"linear": Estimate(3.0, "um", 2.0, 4.0)}, 0.5),
          "Perhaps (50 %) 3.0 µm (90 %: 2.0–4.0) in the z error; no listed mechanism does this."),
     ],
 )  # fmt: skip
-def test_how_things_are_worded(one: Found, words: str) -> None:
+def test_how_things_are_worded(one: Effect, words: str) -> None:
     assert words in statement(one)
 
 
@@ -139,12 +140,12 @@ def test_every_mechanism_is_worded_with_its_place_and_size(key: str) -> None:
     for target in mechanism.acts_at:
         kind = KIND[target]
         parameters = {s.name: Estimate(1.234, s.unit, 1.1, 1.4) for s in mechanism.parameters}
-        said = statement(Found(key, Where(kind, "place"), PLACE[kind], parameters, 0.95))
+        said = statement(Effect(key, Where(kind, "place"), PLACE[kind], parameters, 0.95))
         assert PLACE[kind] in said and said[0].isupper() | said[0].isdigit() and said.endswith(".")
         assert "  " not in said and " ," not in said and ".." not in said and "_" not in said.replace(PLACE[kind], "")
         if mechanism.parameters:
             assert "1.2" in said
-            assert finding_of(Found(key, Where(kind, "place"), PLACE[kind], parameters, 0.95)).equation
+            assert build_finding(Effect(key, Where(kind, "place"), PLACE[kind], parameters, 0.95)).equation
 
 
 class WiperFriction(Mechanism):
@@ -161,13 +162,13 @@ def test_a_new_mechanism_is_worded_without_a_line_more(monkeypatch: pytest.Monke
     module.WiperFriction = WiperFriction  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "wipers_said", module)
     monkeypatch.setitem(MECHANISMS._members, "wiper_friction", "wipers_said:WiperFriction")
-    new = finding_of(Found("wiper_friction", BED, "the guides", {"force": Estimate(81.0, "N", 71.0, 93.0)}, 0.95))
+    new = build_finding(Effect("wiper_friction", BED, "the guides", {"force": Estimate(81.0, "N", 71.0, 93.0)}, 0.95))
     assert new.statement == "Missing: friction of the wipers at the guides, 81 N (90 %: 71–93)."
     assert new.equation == "P = 81.0 N · |v|"
 
 
 def test_the_finding_has_what_the_sentence_says() -> None:
-    finding = finding_of(SINK)
+    finding = build_finding(SINK)
     assert finding.statement == statement(SINK)
     assert finding.equation == "P = 10.2 W/K · (T_floor - T), T_floor = temperature + follow (T_room(0) - temperature)"
     assert finding.where == Place(kind="node", name="bed") and finding.name == "floor_sink_bed"
@@ -177,7 +178,7 @@ def test_the_finding_has_what_the_sentence_says() -> None:
         "before": {"z_um": 9.1}, "after": {"z_um": 1.4}, "noise_floor": {"z_um": 1.2},
     }  # fmt: skip
     assert finding.evidence["gain_nats"] == 41.0
-    fixed = finding_of(replace(SINK, parameters={"follow": Estimate(0.5, "1")}))
+    fixed = build_finding(replace(SINK, parameters={"follow": Estimate(0.5, "1")}))
     assert fixed.parameters["follow"].interval90 is None
 
 
@@ -185,13 +186,13 @@ def test_errors_that_fall_are_told_the_greatest_fall_first_and_those_that_rise_b
     same, sensor = Rms("x", "um", 2.0, 2.02, 0.9), Rms("front", "degC", 0.8, 0.05, math.nan, sensor=True)
     worse, noise = Rms("y", "um", 2.7, 3.0, 0.9), Rms("w", "um", 0.5, 0.8, 0.9)
     equal = replace(worse, before=2.96, after=3.04)  # both are 3.0 in the sentence
-    assert falls((same,)) == falls((worse,)) == falls((replace(Z, before=3.04, after=2.96),)) == ""
+    assert reductions((same,)) == reductions((worse,)) == reductions((replace(Z, before=3.04, after=2.96),)) == ""
     told = (
         "the misfit of the sensor front of runs left out of the fit falls from 0.80 to 0.050 K and the z error falls "
         "from 9.1 to 1.4 µm (noise 1.2)"
     )
-    assert falls((Z, same, sensor, noise)) == told
-    assert falls((Z, same, sensor, worse, equal)) == f"{told}, while the y error rises from 2.7 to 3.0 µm"
+    assert reductions((Z, same, sensor, noise)) == told
+    assert reductions((Z, same, sensor, worse, equal)) == f"{told}, while the y error rises from 2.7 to 3.0 µm"
 
 
 def test_verdicts() -> None:
@@ -237,7 +238,7 @@ def test_verdicts() -> None:
     rear = Rms("T_rear", "degC", 0.9, 0.36, 0.03, sensor=True)
     partly = verdict_statement("partly_explained", [SINK], [Z, rear])
     assert partly.endswith("Not explained: T_rear still at 12 times its noise.")
-    flux = Found("free_flux", Where("node", "column_back"), "the column back", {}, 0.95, regime="coolant on, no lag",
+    flux = Effect("free_flux", Where("node", "column_back"), "the column back", {}, 0.95, regime="coolant on, no lag",
                  size=Estimate(60, "W"))  # fmt: skip
     assert verdict_statement("unlisted", [flux]) == (
         "No listed mechanism explains the difference: 60 W into the column back (when: coolant on, no lag)."

@@ -20,7 +20,7 @@ from diagnosis.diagnose import diagnose
 from diagnosis.drafting.draft import drafted_part
 from diagnosis.findings.schema import Findings
 from diagnosis.fitting.fitted import baseline, relearned
-from diagnosis.localisation.where_when import Found, Located, locate
+from diagnosis.localisation.where_when import FoundPlace, Located, locate
 from diagnosis.result import Diagnosis
 from diagnosis.screening.screen import proposed, screen
 from diagnosis.search.refits import refit
@@ -171,7 +171,7 @@ def spindle_without_its_speed() -> tuple[Located, Mapping[str, tuple[np.ndarray,
 
 
 def beside_speed(
-    located: Located, found: Found, speed: Mapping[str, tuple[np.ndarray, np.ndarray]]
+    located: Located, found: FoundPlace, speed: Mapping[str, tuple[np.ndarray, np.ndarray]]
 ) -> list[np.ndarray]:
     """By run (2, K): the speed's mean about every knot and the reconstructed series there."""
     out = []

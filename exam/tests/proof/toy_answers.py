@@ -10,14 +10,14 @@ import pandas as pd
 from data.batch import Batch
 from data.machine import Machine
 from diagnosis.contracts import COLUMNS
-from diagnosis.findings.schema import Finding, Findings, FitSummary, FoundParameter, LeftOutRms, Place
+from diagnosis.findings.schema import Finding, Findings, FitSummary, FittedParameter, LeftOutRms, Place
 from diagnosis.result import Diagnosis
 from twin.schema import twin_part
 
 FLOOR = Finding(
     mechanism="floor_sink",
     where=Place(kind="node", name="bed"),
-    parameters={"conductance": FoundParameter(value=22.0, unit="W/K", interval90=(18.0, 27.0))},
+    parameters={"conductance": FittedParameter(value=22.0, unit="W/K", interval90=(18.0, 27.0))},
     probability=0.97,
     statement="Missing: heat to the floor at the bed.",
 )
