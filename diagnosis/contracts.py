@@ -157,7 +157,7 @@ class Candidate:
         return CandidateKind.of(self.mechanism)
 
     @property
-    def plain(self) -> str:
+    def base_name(self) -> str:
         """The name, the same at every value at which its shape is looked for."""
         return self.variant_of or self.name
 

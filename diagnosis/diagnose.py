@@ -44,11 +44,11 @@ from diagnosis.fitting.fitted import (
     baseline,
     check,
     degraded_channels,
+    deterministic_fit,
     harms,
     lead_of,
     left_out_rows,
     on_all_rows,
-    plain,
     rows_as_given,
 )
 from diagnosis.localisation.balance import impossible
@@ -149,7 +149,7 @@ def _diagnosis(
     machine, final, named = done.baseline.machine, done.final, done.accepted
     before, after = left_out_rows(done.baseline), left_out_rows(final)
     full = on_all_rows(final, batches)
-    intervals = {i.name: i for i in _intervals(plain(full))}
+    intervals = {i.name: i for i in _intervals(deterministic_fit(full))}
     rms_table = made.rms_table(before, after, final)
     rms = rms_of(rms_table, final)
     part_after = with_deviations(final)
@@ -253,8 +253,8 @@ def _without(done: Search, harmful: Sequence[Round]) -> Fitted | None:
 
 
 def _new_file(part: TwinPart, written: Fitted, findings: Sequence[Finding], runs: int) -> dict[str, Any]:
-    """What `diagnosed_text` takes: values of the fit that simulates alone, parts, and notes on those that it has."""
-    intervals, added = _intervals(plain(written)), changed_parts(part, with_deviations(written))
+    """The arguments of `diagnosed_text`: values of the deterministic fit, parts, and notes on them."""
+    intervals, added = _intervals(deterministic_fit(written)), changed_parts(part, with_deviations(written))
     notes = _notes(findings, runs)
     return {
         "values": {i.name: i.value for i in intervals}, "intervals": intervals, "added": added,
@@ -285,7 +285,7 @@ def _detection_limits(table: pd.DataFrame) -> tuple[DetectionLimit, ...]:
 
 
 def rows_of(table: pd.DataFrame) -> list[tuple[Any, ...]]:
-    """The table's rows as plain tuples."""
+    """The table's rows as tuples."""
     return list(table.itertuples(index=False, name=None))
 
 

@@ -40,7 +40,7 @@ class Policy:
     first_steps: int = cost(40, "steps", "bounds the descent from the values of the machine file")
     baseline_steps: int = cost(12, "steps", "under each covariance")
     own_rounds: int = cost(2, "rounds", "of the fit's values and the runs' own unknowns in turn")
-    plain_steps: int = cost(20, "steps", "of a fit that is to simulate alone; most end after ten")
+    deterministic_steps: int = cost(20, "steps", "of a deterministic fit; most end after ten")
 
     # Refined twins and their covariance
     refined_twins: int = cost(100, "draws", "directions of structure; half as many about the first calibration")
@@ -284,7 +284,7 @@ class Policy:
     idle_prior_share: float = analytic(1.0 - 1e-9, "of the prior sd", "a parameter that keeps it does nothing there")
     stands_alone_probability: float = convention(0.7, "probability", "with a tie below it nothing is decided")
     untied_probability: float = convention(0.9, "probability", "above it no alternative is tied")
-    plain_probability: float = convention(0.9, "probability", "above it a claim is stated plainly")
+    unhedged_probability: float = convention(0.9, "probability", "above it a claim is stated without a hedge")
     likely_probability: float = convention(0.6, "probability", "above it a claim is most likely, below it perhaps")
     reduced_max_share: float = convention(0.98, "of the error before", "an error that keeps more is not reduced")
     noise_max_ratio: float = convention(1.5, "times the given noise", "a channel up to it is noise")

@@ -58,8 +58,8 @@ class Form:
         return self.where.kind == "node"
 
     @property
-    def plain(self) -> bool:
-        """Whether it follows one thing, in proportion: a product or a square hardly shows where neither factor does."""
+    def linear(self) -> bool:
+        """Whether it is proportional to one quantity: a product or a square hardly shows where neither factor does."""
         return self.role in ("constant", "linear", "per_K")
 
     @property

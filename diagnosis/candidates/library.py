@@ -133,10 +133,10 @@ def _words_of(machine: Machine, part: TwinPart | None) -> set[str]:
     texts = [*machine.channels]
     for group in (part.bodies, part.surroundings, part.mechanisms) if part else ():
         texts += [text for name, given in group.items() for text in (name, given.words)]
-    plain = " ".join(texts).lower()
+    text = " ".join(texts).lower()
     for umlaut, written in (("ä", "ae"), ("ö", "oe"), ("ü", "ue"), ("ß", "ss")):
-        plain = plain.replace(umlaut, written)
-    return set(re.findall(r"[a-z]+", plain))
+        text = text.replace(umlaut, written)
+    return set(re.findall(r"[a-z]+", text))
 
 
 def _at(

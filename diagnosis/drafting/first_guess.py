@@ -188,7 +188,7 @@ LAWS: Mapping[str, tuple[str, float]] = {
 def driven(machine: Machine, tops: Mapping[str, float]) -> tuple[list[Driven], list[str]]:
     """The drivers that some law takes, and remarks on those that none does."""
     out, remarks = [], []
-    for driver, name in zip(tops, plain_names([f"heat_of_{d}" for d in tops]), strict=True):
+    for driver, name in zip(tops, valid_names([f"heat_of_{d}" for d in tops]), strict=True):
         unit = machine.channels[driver].unit
         if unit in LAWS:
             out.append(Driven(name, driver, unit, *LAWS[unit], tops[driver]))
@@ -197,13 +197,13 @@ def driven(machine: Machine, tops: Mapping[str, float]) -> tuple[list[Driven], l
     return out, remarks
 
 
-def plain_names(channels: Sequence[str], taken: Sequence[str] = ()) -> tuple[str, ...]:
+def valid_names(channels: Sequence[str], taken: Sequence[str] = ()) -> tuple[str, ...]:
     """Names that a machine file allows, after channels: letters, digits, underscores, each its own and none taken."""
     out: list[str] = []
     for channel in channels:
-        plain = "".join(c if c.isalnum() and c.isascii() else "_" for c in channel)
-        plain = plain if plain[:1].isalpha() else f"at_{plain}"
-        while plain in (*out, *taken):
-            plain += "_2"
-        out.append(plain)
+        name = "".join(c if c.isalnum() and c.isascii() else "_" for c in channel)
+        name = name if name[:1].isalpha() else f"at_{name}"
+        while name in (*out, *taken):
+            name += "_2"
+        out.append(name)
     return tuple(out)

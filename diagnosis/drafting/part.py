@@ -11,7 +11,7 @@ import numpy as np
 from data.arrays import Array
 from data.machine import Machine
 from diagnosis.contracts import with_value
-from diagnosis.drafting.first_guess import Balance, Driven, Guess, guess, plain_names
+from diagnosis.drafting.first_guess import Balance, Driven, Guess, guess, valid_names
 from diagnosis.drafting.groups import Rises, Rows, between, tree_of
 from diagnosis.policy import POLICY
 from twin.network import Network
@@ -58,7 +58,7 @@ def sketch(rows: Rows, rises: Rises, heats: Sequence[Driven], count: int, extra_
     found = replace(found.scaled(1.0 / size), heat_W=found.heat_W[:, warm] / size)
     return Sketch(
         groups=tuple(tuple(g) for g in groups),
-        names=plain_names([rises.names[rises.centre(g)] for g in groups], ["room"]),
+        names=valid_names([rises.names[rises.centre(g)] for g in groups], ["room"]),
         links=tuple(links),
         guess=found,
         heats=tuple(heats[k] for k in warm),

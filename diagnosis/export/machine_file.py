@@ -16,7 +16,7 @@ from data.errors import InputError, WorkError, closest
 from data.machine import Machine, parse_machine
 from data.yaml_edit import YamlText
 from diagnosis.contracts import PART_GROUPS, Fitted, with_parts, with_value
-from diagnosis.export.yaml_text import DIGITS, part_plain, plain, tidied
+from diagnosis.export.yaml_text import DIGITS, as_yaml, part_yaml, tidied
 from twin.calibration.calibrated_file import Update, held_steps, kept, put_values, with_calibrated
 from twin.calibration.identifiability import Interval
 from twin.compile import compile_network, own_paths
@@ -87,7 +87,7 @@ def drafted_text(text: str, part: TwinPart, where: str, note: str = "") -> str:
         raise InputError(f"{where}: has a twin part already; nothing is drafted over it")
     part = tidied_part(part)
     document = YamlText(text)
-    document.set([], "twin", part_plain(part), note, blocks=2)
+    document.set([], "twin", part_yaml(part), note, blocks=2)
     new = str(document)
     network = compile_network(machine, where, part)
     _check(new, machine, part, network, {}, {}, where)
@@ -161,14 +161,14 @@ def _filled(
 def _put_part(document: YamlText, path: str, given: BaseModel, old: TwinPart) -> None:
     """A new part whole; of a changed one only the keys that changed, so that its other comments stay."""
     group, name = path.split(".", 1)
-    before, whole = getattr(old, group).get(name), plain(given)
-    if type(before) is type(given) and isinstance(plain(before, name), dict):
+    before, whole = getattr(old, group).get(name), as_yaml(given)
+    if type(before) is type(given) and isinstance(as_yaml(before, name), dict):
         changed = [k for k in type(given).model_fields if getattr(before, k) != getattr(given, k)]
         if set(changed) <= set(whole):
             for key in changed:
                 document.set(["twin", group, name], key, whole[key])
             return
-    document.set(["twin", group], name, plain(given, name), order=GROUPS)
+    document.set(["twin", group], name, as_yaml(given, name), order=GROUPS)
 
 
 def _put_default(document: YamlText, path: str, network: Network, own: Mapping[str, str]) -> None:

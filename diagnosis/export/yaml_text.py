@@ -19,17 +19,17 @@ _FIELDS = {
 } | {n: specs.LENGTH for n in ("width", "thickness", "height", "depth", "lever")}  # fmt: skip
 
 
-def plain(model: BaseModel, key: str = "") -> Any:
-    """What YAML is to hold of a part of a twin: no defaults, bare numbers with their units, short forms.
+def as_yaml(model: BaseModel, key: str = "") -> Any:
+    """A part of a twin as YAML holds it: no defaults, numbers with their units, short forms.
 
-    `key` is its name in the file: a link ``a-b`` between a and b need not say so again.
+    `key` is its name in the file: a link ``a-b`` is between a and b without a statement of its ends.
     """
     owned = {s.name: s for s in MECHANISMS[model.law].parameters} if isinstance(model, MechanismPart) else {}
     out: dict[str, Any] = {}
     for name, field in type(model).model_fields.items():
         held = getattr(model, name)
         if field.is_required() or held != field.get_default(call_default_factory=True):
-            out[name] = _plain(held, name, owned)
+            out[name] = _as_yaml(held, name, owned)
     ends: dict[str, Any] = {"between": key.split("-")} if isinstance(model, Link) else {}
     if isinstance(model, Exposure):
         ends = dict(zip(("of", "to"), key.split("-"), strict=False))
@@ -48,29 +48,29 @@ def tidied(value: Value) -> Value:
     return value.model_copy(update=update)
 
 
-def part_plain(part: TwinPart) -> dict[str, Any]:
-    """A whole twin part for YAML."""
+def part_yaml(part: TwinPart) -> dict[str, Any]:
+    """A whole twin part as YAML holds it."""
     out: dict[str, Any] = {}
     for group, field in TwinPart.model_fields.items():
         held = getattr(part, group)
         if isinstance(held, BaseModel):
-            out[group] = plain(held)
+            out[group] = as_yaml(held)
         elif isinstance(held, Mapping):
-            out |= {group: {k: plain(v, k) for k, v in held.items()}} if held else {}
+            out |= {group: {k: as_yaml(v, k) for k, v in held.items()}} if held else {}
         elif held != field.default:
             out[group] = held
     return out
 
 
-def _plain(held: Any, name: str, owned: Mapping[str, Spec]) -> Any:
+def _as_yaml(held: Any, name: str, owned: Mapping[str, Spec]) -> Any:
     if isinstance(held, Value):
         return _value(held, owned.get(name) or _FIELDS.get(name))
     if isinstance(held, BaseModel):
-        return plain(held)
+        return as_yaml(held)
     if isinstance(held, Mapping):
-        return {k: _plain(v, str(k), owned) for k, v in held.items()}
+        return {k: _as_yaml(v, str(k), owned) for k, v in held.items()}
     if isinstance(held, tuple):
-        return [_plain(v, name, owned) for v in held]
+        return [_as_yaml(v, name, owned) for v in held]
     return held
 
 

@@ -281,9 +281,9 @@ def _widened(i: Interval, spec: Spec, more: float) -> Estimate:
 def _network_name(final: Fitted, instance: str, parameter: str, place: str) -> str | None:
     """The network name of a mechanism's parameter, in its instance or in the parts that the mechanism adds."""
     names = [p.name for p in final.problem.network.parameters]
-    plain = f"mechanisms.{instance}.{parameter}"
-    if plain in names:
-        return plain
+    direct = f"mechanisms.{instance}.{parameter}"
+    if direct in names:
+        return direct
     ends = [n for n in names if n.endswith(f".{parameter}") and instance in n]
     if ends:
         return ends[0]

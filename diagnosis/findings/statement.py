@@ -317,7 +317,7 @@ def _others(effect: Effect) -> list[str]:
 
 def _doubt(effect: Effect) -> str:
     """`` (41 %; or radiation at the bed, 52 %)``: of one effect among several; nothing where it is sure."""
-    if effect.probability > POLICY.plain_probability:
+    if effect.probability > POLICY.unhedged_probability:
         return ""
     tied = [f"{_other_phrase(o)}, {percent(o.probability)}" for o in effect.tied]
     return f" ({percent(effect.probability)}{''.join(f'; or {text}' for text in tied)})"
@@ -341,7 +341,7 @@ def _advice(effect: Effect) -> list[str]:
 
 
 def _hedge(probability: float) -> str:
-    if probability > POLICY.plain_probability:
+    if probability > POLICY.unhedged_probability:
         return ""
     return f"{'most likely' if probability >= POLICY.likely_probability else 'perhaps'} ({percent(probability)})"
 

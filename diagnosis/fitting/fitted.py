@@ -150,10 +150,10 @@ def _first_calibration(channels: int) -> tuple[FitOptions, Noise]:
 
 
 def on_all_rows(fitted: Fitted, batches: Sequence[Batch]) -> Fitted:
-    """The fit, simulated alone, to the recordings as they are; itself where they have no rows between."""
+    """The deterministic fit to all rows of the recordings; the fit itself where they have no others."""
     if [b.n_rows for b in batches] == [b.n_rows for b in fitted.batches]:
         return fitted
-    one, batches = plain(fitted), acting(batches, fitted.lead_rows)
+    one, batches = deterministic_fit(fitted), acting(batches, fitted.lead_rows)
     problem = CalibrationProblem.of(one.problem.network, batches, spacing_s(batches))
     at = Point(one.machine, one.part, tuple(batches), problem, one.z, one.nuisance, one.lead_rows)
     return replace(calibrated(at, one.noise, one.runs), base=fitted)
@@ -381,16 +381,16 @@ class LeftOutRows:
 
 
 @lru_cache(maxsize=4)  # a fit holds some 100 MB
-def plain(fitted: Fitted) -> Fitted:
-    """The same twin part calibrated to simulate alone: each channel's misfit is its noise, and rows that repeat each
-    other count as one (`twin.calibration`). What a machine file states is simulated without structure.
+def deterministic_fit(fitted: Fitted) -> Fitted:
+    """The same twin part calibrated without structure: the misfit of each channel is its noise, and correlated rows
+    count as one (`twin.calibration`). What a machine file states is simulated without structure.
 
-    Structure can hold a fit where no twin simulates well alone: where a misfit passes for noise, the likelier optimum
-    is taken, from here and from where the twin that it was begun from simulates alone, or else the priors' means.
+    Under structure a fit can end where no simulation without it is good. Where a misfit is taken for noise, the optimum
+    of the higher posterior is returned, from here and from the deterministic fit of `base`, or the priors' means.
     """
     problem, tolerance = fitted.problem, POLICY.fit_tolerance_nats
     state = State.at(problem, fitted.z, fitted.own, fitted.noise)
-    state = annealed(problem, state, POLICY.plain_steps, tolerance)
+    state = annealed(problem, state, POLICY.deterministic_steps, tolerance)
     if misfits(noise_left(problem, state)):
         with suppress(WorkError, InputError):  # no machine has such values
             state = likelier(problem, state, _elsewhere(fitted))
@@ -398,15 +398,15 @@ def plain(fitted: Fitted) -> Fitted:
 
 
 def _elsewhere(fitted: Fitted) -> State:
-    """An optimum without structure, reached without a look at where the fit is."""
+    """An optimum without structure that does not begin at the fit."""
     problem, base, tolerance = fitted.problem, fitted.base, POLICY.fit_tolerance_nats
     if base is None:
-        options = FitOptions(max_iterations=POLICY.plain_steps, tolerance=tolerance, reweight=True)
+        options = FitOptions(max_iterations=POLICY.deterministic_steps, tolerance=tolerance, reweight=True)
         return converge(problem, options)[0]
-    one = plain(base)
+    one = deterministic_fit(base)
     z = carried_z(one.problem, problem, one.z, fitted.z)
     state = State.at(problem, z, carried_nuisances(one.problem, problem, one.nuisance), one.noise)
-    return annealed(problem, state, POLICY.plain_steps, tolerance)
+    return annealed(problem, state, POLICY.deterministic_steps, tolerance)
 
 
 def _moved(at: Point, state: State) -> Point:
@@ -420,8 +420,9 @@ def calibrated(at: Point, noise: Noise, runs: int = 0) -> Fitted:
 
 @lru_cache(maxsize=4)  # a fit holds some 100 MB
 def left_out_rows(fitted: Fitted) -> LeftOutRows:
-    """Every batch predicted, free-running, by the `plain` fit to all others; its starts and zeros are its own."""
-    return _left_out(plain(fitted))
+    """Every batch predicted, free-running, by the `deterministic_fit` to all others; its starts and zeros are its
+    own."""
+    return _left_out(deterministic_fit(fitted))
 
 
 def _left_out(one: Fitted) -> LeftOutRows:

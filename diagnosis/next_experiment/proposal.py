@@ -141,8 +141,8 @@ def _options(seen: Foreseen, runs: Sequence[Run]) -> list[_Option]:
         """Of both orders, (P, …)."""
         return np.array([np.minimum(nats[a, b], nats[b, a]) for a, b in combinations(range(len(nats)), 2)])
 
-    plain, more = least(seen.nats), least(seen.with_sensor)
-    out = [_Option(run, None, plain[:, r]) for r, run in enumerate(runs)]
+    given, more = least(seen.nats), least(seen.with_sensor)
+    out = [_Option(run, None, given[:, r]) for r, run in enumerate(runs)]
     out += [_Option(run, p, more[:, r, e]) for r, run in enumerate(runs) for e, p in enumerate(seen.places)]
     return out
 

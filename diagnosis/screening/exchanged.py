@@ -66,7 +66,7 @@ class _Line:
     columns: list[Array]
     residuals: list[Array]
     numbers: list[NDArray[np.int64]]
-    plain: list[list[_Channel]]  # by batch and channel, as they are named
+    as_named: list[list[_Channel]]  # by batch and channel
 
     @classmethod
     def at(cls, fitted: Fitted) -> _Line:
@@ -81,27 +81,27 @@ class _Line:
             residuals.append(block.residual)
             numbers.append(np.concatenate([np.arange(len(spread)), size + np.arange(q)]))
             size += q
-        plain = [
+        as_named = [
             [_Channel.of(j[m.channel == k], r[m.channel == k]) for k in range(len(problem.channels))]
             for m, j, r in zip(problem.measured, columns, residuals, strict=True)
         ]
-        return cls(problem.measured, problem.noise, size, columns, residuals, numbers, plain)
+        return cls(problem.measured, problem.noise, size, columns, residuals, numbers, as_named)
 
     def gain(self, one: int, other: int) -> float:
         """Nats by which two channels named the other way round fit better; both are compared at their common rows,
         unless all rows as they are fit better anyway."""
-        named, exchanged = [list(b) for b in self.plain], [list(b) for b in self.plain]
+        named, exchanged = [list(b) for b in self.as_named], [list(b) for b in self.as_named]
         for b, pieces in enumerate(self._common(one, other)):
             for k, columns, right, wrong in pieces:
                 named[b][k] = _Channel.of(columns, right)
                 exchanged[b][k] = _Channel.of(columns, wrong)
         cost = self._cost(exchanged)
-        plain = self.cost_as_named - cost
-        return plain if plain < 0 else self._cost(named) - cost
+        gain = self.cost_as_named - cost
+        return gain if gain < 0 else self._cost(named) - cost
 
     @cached_property
     def cost_as_named(self) -> float:
-        return self._cost(self.plain)
+        return self._cost(self.as_named)
 
     def _common(self, one: int, other: int) -> Iterator[list[tuple[int, Array, Array, Array]]]:
         """Of every batch, for both channels: number, columns, and residuals as named and exchanged."""

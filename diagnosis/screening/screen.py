@@ -167,7 +167,7 @@ def one_of_each(scored: Sequence[Scored]) -> list[Scored]:
     """Of what was looked for at several values of its shape, the first; in the same order."""
     first: dict[str, Scored] = {}
     for s in scored:
-        first.setdefault(s.candidate.plain, s)
+        first.setdefault(s.candidate.base_name, s)
     return list(first.values())
 
 

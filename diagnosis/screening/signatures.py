@@ -122,7 +122,7 @@ def _is_of(c: Candidate, p: Parameter) -> bool:
 
 
 def _free(p: Parameter) -> Parameter:
-    """An amplitude as a plain signed number, so that its derivative is not scaled away where it is 0."""
+    """An amplitude as a signed number, so that its derivative is not scaled away where it is 0."""
     return replace(p, free=True, scale="linear", spread=1.0, low=-np.inf, high=np.inf, source="")
 
 

@@ -94,10 +94,10 @@ def one_round(
     `listed`."""
     report("screen", 0, 0)
     forms = _forms(now)
-    plain = [c for c, f in forms.values() if f.plain]
-    seen = screen(now, [*(proposed(now) if listed else ()), *plain], before)
+    linear = [c for c, f in forms.values() if f.linear]
+    seen = screen(now, [*(proposed(now) if listed else ()), *linear], before)
     places = list(dict.fromkeys(s.candidate.where for s in seen.scored))[: POLICY.form_places]
-    more = [c for c, f in forms.values() if not f.plain and f.where in places]
+    more = [c for c, f in forms.values() if not f.linear and f.where in places]
     seen = screen(now, [*(s.candidate for s in seen.scored), *more], seen)
     odds = odds_of(now, seen)
     tried = refits(now, seen, shortlist(now, seen, odds), odds, workers, report)

@@ -94,8 +94,10 @@ def headline(verdict: str, probabilities: Sequence[float], left: str = "") -> st
     remains = f"{left} is left" if left else ""
     n, most, least = len(probabilities), max(probabilities, default=1.0), min(probabilities, default=1.0)
     the = "Perhaps the" if most < POLICY.likely_probability else "Most likely the"
-    the = "The" if most >= POLICY.plain_probability else the
-    effects = "one effect" if n == 1 else f"{'up to ' if least < POLICY.plain_probability else ''}{_spelled(n)} effects"
+    the = "The" if most >= POLICY.unhedged_probability else the
+    effects = (
+        "one effect" if n == 1 else f"{'up to ' if least < POLICY.unhedged_probability else ''}{_spelled(n)} effects"
+    )
     return {
         "consistent": "Consistent: no missing effect is supported by these runs" + (f"; {remains}." if left else "."),
         "explained": f"{the} simulation left out {effects}; with {'it' if n == 1 else 'them'} noise alone is left.",

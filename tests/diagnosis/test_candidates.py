@@ -119,21 +119,22 @@ def test_the_ground_is_no_air_that_a_gate_cools() -> None:
 
 
 def test_every_value_that_is_looked_for_is_a_candidate_of_its_own() -> None:
-    gates = [c for c in of(four_bodies(), "draught") if c.plain == "draught_room"]
+    gates = [c for c in of(four_bodies(), "draught") if c.base_name == "draught_room"]
     stated = [{k: v.value for k, v in c.part.parameters.items()} for c in gates if c.part]
     by_clock = [s for s in stated if set(s) == {"start", "clock"}]
     assert len(gates) == 1 + len(by_clock) and len(by_clock) > 10
     assert {"start": "6 h", "clock": 1.0} in by_clock
     assert all(c.amplitudes == {"factor": 1.0, "drop": 0.0} for c in gates)
     units = [c for c in of(equipped(), "hydraulic_unit") if c.where.name == "bed"]
-    assert {len([c for c in units if c.plain == p]) for p in ("hydraulic_unit_bed", "hydraulic_unit_bed_coolant")} == {
+    named = ("hydraulic_unit_bed", "hydraulic_unit_bed_coolant")
+    assert {len([c for c in units if c.base_name == p]) for p in named} == {
         6, 1,
     }  # fmt: skip
 
 
 def test_a_draught_is_looked_for_in_every_part_of_a_run() -> None:
     now = fitted(two_bodies(), runs(two_bodies(), count=3))
-    gates = [c for c in proposed(now) if c.plain == "draught_room" and "_at_" in c.name]
+    gates = [c for c in proposed(now) if c.base_name == "draught_room" and "_at_" in c.name]
     windows = [{k: v.value for k, v in c.part.parameters.items()} for c in gates if c.part]
     hours = [convert(w["start"], "h") for w in windows]
     run_h = now.batches[0].step_s * now.batches[0].n_rows / 3600.0
@@ -171,7 +172,7 @@ def test_what_multiplies_heat_goes_with_its_own_laws() -> None:
 
 def test_what_a_sensor_states_is_fitted_and_not_proposed() -> None:
     given = four_bodies(sensors__t_bed__offset="0.1 K")
-    assert {c.plain for c in of(given, "sensor_lag")} == {"sensor_lag_t_spindle", "sensor_lag_t_bed"}
+    assert {c.base_name for c in of(given, "sensor_lag")} == {"sensor_lag_t_spindle", "sensor_lag_t_bed"}
     assert names(given, "sensor_bonding") == {"sensor_bonding_t_spindle_room", "sensor_bonding_t_bed_room"}
     assert names(given, "sensor_offset") == {"sensor_offset_t_spindle", "sensor_offset_t_head"}
 

@@ -17,7 +17,7 @@ from data.errors import InputError
 from data.machine import Machine, load_machine
 from data.recording import read_batches
 from diagnosis.drafting.draft import Drafted, drafted_part
-from diagnosis.drafting.first_guess import Balance, guess, plain_names
+from diagnosis.drafting.first_guess import Balance, guess, valid_names
 from plants.sample.sample_year import write_sample_year
 from tests.twin.machines import machine
 from tests.twin.recordings import empty_batches, recorded
@@ -316,4 +316,4 @@ def test_integrated_balances_give_the_rates_of_two_bodies() -> None:
 
 
 def test_names_are_what_a_machine_file_allows() -> None:
-    assert plain_names(["T-1", "T_1", "3rd", "room"], ["room"]) == ("T_1", "T_1_2", "at_3rd", "room_2")
+    assert valid_names(["T-1", "T_1", "3rd", "room"], ["room"]) == ("T_1", "T_1_2", "at_3rd", "room_2")

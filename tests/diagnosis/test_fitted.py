@@ -11,7 +11,15 @@ import pytest
 
 from data.arrays import Array
 from diagnosis.contracts import Fitted
-from diagnosis.fitting.fitted import LeftOutRows, afresh, left_out_rows, plain, refitted, relearned, relinearised
+from diagnosis.fitting.fitted import (
+    LeftOutRows,
+    afresh,
+    deterministic_fit,
+    left_out_rows,
+    refitted,
+    relearned,
+    relinearised,
+)
 from tests.diagnosis.small_cases import FLOOR, cold_floor, consistent
 from twin.calibration.estimate import CalibrationOptions, LeftOut, leave_batch_out
 from twin.calibration.identifiability import intervals90
@@ -102,7 +110,7 @@ def test_a_fit_that_structure_holds_elsewhere_still_simulates_alone_at_the_likel
     """Channels whose rows are far off pass for noise where a fit begins there; the priors' means are nearer."""
     done = with_the_floor()
     held = replace(done, z=np.where(np.arange(len(done.z)) % 2, 6.0, -6.0))
-    z, own = plain(done).z, plain(held).z
+    z, own = deterministic_fit(done).z, deterministic_fit(held).z
     assert np.abs(held.z - z).max() > 5.0
     assert np.abs(own - z).max() < 0.1
     back = relearned(relinearised(held, 0))
@@ -124,7 +132,7 @@ def own_start_estimated(done: Fitted, k: int, values: Array) -> Array:
     own: Array = np.zeros(done.problem.nuisance_sizes[k])
     for _ in range(5):
         (block,) = one.linearise(x, [own])
-        weight = plain(done).noise.weight[block.channel]
+        weight = deterministic_fit(done).noise.weight[block.channel]
         normal = (block.nuisance.T * weight) @ block.nuisance + np.eye(len(own))
         aim = (block.nuisance.T * weight) @ (block.residual + block.nuisance @ own)
         own = np.asarray(np.linalg.solve(normal, aim), float)

@@ -94,10 +94,10 @@ def test_it_is_what_reaches_the_threshold_and_a_margin() -> None:
 
 def test_every_mechanism_that_can_be_switched_off_has_one() -> None:
     assert tuple(table().columns) == COLUMNS["limits"]
-    smooth = {s.candidate.plain for s in one_of_each(seen().scored) if s.candidate.amplitudes}
-    name_of = {c.label: c.plain for c in proposed(consistent())}
+    smooth = {s.candidate.base_name for s in one_of_each(seen().scored) if s.candidate.amplitudes}
+    name_of = {c.label: c.base_name for c in proposed(consistent())}
     assert {name_of[words] for words in table()["words"]} == smooth and len(table()) == len(smooth)
-    every = {c.plain: c.label for c in proposed(consistent()) if c.amplitudes}
+    every = {c.base_name: c.label for c in proposed(consistent()) if c.amplitudes}
     assert len(every) == len(smooth)
     for row in rows():
         assert row.unit in {s.unit for s in MECHANISMS[row.mechanism].parameters}

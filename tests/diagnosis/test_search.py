@@ -13,7 +13,7 @@ from data.errors import InputError, WorkError
 from data.processes import Processes
 from diagnosis.candidates.discretisation import never_reported, slack
 from diagnosis.contracts import Fitted
-from diagnosis.fitting.fitted import degraded_channels, left_out_rows, plain
+from diagnosis.fitting.fitted import degraded_channels, deterministic_fit, left_out_rows
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import proposed
 from diagnosis.search import refits as refits_module
@@ -41,13 +41,13 @@ def found(case: str) -> Search:
 
 
 def names(done: Search) -> list[str]:
-    return [r.best.candidate.plain for r in done.accepted if r.best is not None]
+    return [r.best.candidate.base_name for r in done.accepted if r.best is not None]
 
 
 def stated(done: Search) -> dict[str, Interval]:
     """By name, numbers of where a shape began left out."""
-    fit = result(done.final.problem, plain(done.final).state, 0.01, "")
-    number = {r.best.candidate.name: r.best.candidate.plain for r in done.accepted if r.best is not None}
+    fit = result(done.final.problem, deterministic_fit(done.final).state, 0.01, "")
+    number = {r.best.candidate.name: r.best.candidate.base_name for r in done.accepted if r.best is not None}
     out = {}
     for i in intervals90(fit, done.final.problem.unknowns):
         group, entry, value = i.name.split(".")
