@@ -25,8 +25,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from data.processes import Processes
-from diagnosis.contracts import Candidate, Fitted, Scored
+from diagnosis.contracts import Candidate, Scored
 from diagnosis.diagnose import diagnose
+from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import baseline
 from diagnosis.fitting.twins import drawn_misfits
 from diagnosis.localisation.where_when import locate

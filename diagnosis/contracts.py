@@ -1,10 +1,10 @@
-"""Types that the stages of a diagnosis share: candidates as changes of a twin part, fits, refits."""
+"""Types that the stages of a diagnosis share: candidates as changes of a twin part, and points of a fit."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
 from typing import Any, Literal
@@ -15,10 +15,7 @@ from pydantic import BaseModel
 from data.arrays import Array
 from data.batch import Batch
 from data.machine import Machine
-from diagnosis.fitting.marginal import Grams, Hyper, Level, Marginal
-from diagnosis.policy import POLICY
-from twin.calibration.fit_problem import Noise, estimate
-from twin.calibration.least_squares import State, x_of
+from twin.calibration.fit_problem import x_of
 from twin.calibration.problem import CalibrationProblem
 from twin.quantity import Parameter, Value
 from twin.schema import MechanismPart, TwinPart
@@ -224,106 +221,6 @@ class Point:
         """Rows (K,) of each channel in all batches."""
         every = np.concatenate([m.channel for m in self.problem.measured])
         return np.bincount(every, minlength=len(self.problem.channels)).astype(float)
-
-
-@dataclass(frozen=True, eq=False)
-class Fitted(Point):
-    """A point at its best fit under a covariance, at the hyperparameters `hyper` of that.
-
-    `columns` (n_b, p + 1) of every batch are the whitened model, per unit of z, and the target; `runs` that the batches
-    come from, where they are blocks of fewer. `nuisance` is where the batches' own unknowns were linearised, `own` what
-    they are in this fit.
-    """
-
-    marginal: Marginal
-    hyper: Hyper
-    columns: list[Array]
-    runs: int = 0
-    base: Fitted | None = None  # that this one was begun from, by another twin part
-
-    @cached_property
-    def grams(self) -> Grams:
-        return self.marginal.grams(self.columns)
-
-    @property
-    def level(self) -> Level:
-        return self.marginal.level(self.hyper)
-
-    @cached_property
-    def log_evidence(self) -> float:
-        """Nats, up to a constant of the recordings (Laplace approximation), of what z shows."""
-        return self.level.log_evidence(self.grams, self.z)
-
-    @cached_property
-    def log_predictive_density(self) -> Array:
-        """Log density (B,) of every batch, predicted from all others, in nats."""
-        return self.level.log_predictive_density(self.grams)
-
-    @cached_property
-    def own(self) -> list[Array]:
-        """Each batch's unknowns by least squares under the covariance's blocks: a start is no structure."""
-        white, blocks = self.marginal.covariance.white, self.problem.linearise(self.x, self.nuisance)
-        starts = len(self.problem.nuisances.start_K)  # an effect may add a body to those of the marginal
-        every = enumerate(zip(blocks, self.nuisance, strict=True))
-        return [
-            v + own_step(white(k, b.nuisance), v, white(k, b.residual), self.hyper.own_sizes(len(v), starts))
-            for k, (b, v) in every
-        ]
-
-    @cached_property
-    def noise(self) -> Noise:
-        """What each channel leaves, and how many rows count as one."""
-        left = self.problem.residuals(self.x, self.own)
-        return estimate(left, [m.channel for m in self.problem.measured], len(self.problem.channels), len(self.z))
-
-    @cached_property
-    def state(self) -> State:
-        """The fit as a calibration has it; its information is that with structure integrated out."""
-        state = State.at(self.problem, self.z, self.own, self.noise)
-        c = self.level.reduced(self.grams)[:-1, :-1]
-        root = np.asarray(np.linalg.cholesky(c + self.level.prior * np.eye(len(c))).T, float)
-        return replace(state, arrow=replace(state.arrow, root=root, target=np.zeros(len(c))))
-
-
-def own_step(jacobian: Array, own: Array, left: Array, size: Array | float = 1.0) -> Array:
-    """The step (q,) of a batch's own unknowns from `own` that leaves least of rows `left` (n,), priors of sd `size`
-    counted."""
-    precision = np.broadcast_to(1.0 / np.asarray(size) ** 2, own.shape)
-    normal = jacobian.T @ jacobian + np.diag(precision)
-    return np.asarray(np.linalg.solve(normal, jacobian.T @ left - precision * own), float)
-
-
-@dataclass(frozen=True)
-class Tried:
-    """A candidate after its full refit; `gain` in nats of log evidence over the fit before.
-
-    `by_run` (B,) is what each left-out batch gains, `cluster` the first of the candidates that these recordings cannot
-    distinguish, `log_prior` of its law and of the equipment that it needs. Where it is `confirmed`, the gain is
-    the lesser under two structures: that of the fit before, and the one that is drawn anew about either fit.
-    """
-
-    scored: Scored
-    fitted: Fitted
-    gain: float
-    by_run: Array
-    cluster: str
-    log_prior: float
-    confirmed: bool = False
-
-    @property
-    def candidate(self) -> Candidate:
-        return self.scored.candidate
-
-    @property
-    def improved(self) -> int:
-        """Left-out batches that are predicted better."""
-        return int((self.by_run > 0).sum())
-
-    @property
-    def score(self) -> float:
-        """Log weight among explanations; free forms imitate any law to within a share of its gain."""
-        credit = POLICY.free_form_credit if self.candidate.kind.is_unlisted else 1.0
-        return credit * self.gain + self.log_prior
 
 
 # Left-out values throughout. kind and name: where, as in the findings; a candidate's unique name may stand there too.

@@ -16,7 +16,7 @@ from data.errors import InputError, WorkError
 from data.machine import Machine
 from data.processes import Processes
 from diagnosis.candidates.free_forms import Form
-from diagnosis.contracts import Fitted, Where
+from diagnosis.contracts import Where
 from diagnosis.drafting.draft import drafted_part
 from diagnosis.export.machine_file import changed_parts, with_deviations
 from diagnosis.findings import report_data as made
@@ -40,6 +40,7 @@ from diagnosis.findings.schema import (
 )
 from diagnosis.findings.statement import build_finding, verdict_statement
 from diagnosis.fitting.batches import enough_batches, usable_batches
+from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import (
     baseline,
     check,

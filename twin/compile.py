@@ -9,11 +9,11 @@ import numpy as np
 
 from data.errors import InputError, closest
 from data.machine import Machine
-from twin.compiling.cells import Scope, exposure, inside, link, number, several
+from twin.compiling.cells import Scope, exposure, inside, link, number
 from twin.compiling.laws import acting_on, error, heats, law_of, mechanism_of, reading, starts, surrounding
 from twin.network import Network
 from twin.quantity import Value, convert
-from twin.schema import TwinPart, twin_part
+from twin.schema import TwinPart, several, twin_part
 
 CLOSED_M = 1e-6  # an error chain's lengths add up this well
 TYPICAL_UM_PER_M_K = 11.0

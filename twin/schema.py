@@ -252,3 +252,8 @@ MATERIALS: Mapping[str, Mapping[str, float]] = MappingProxyType({
     "brass": {"specific_heat": 380.0, "conductivity": 115.0, "expansion": 19.0},
     "copper": {"specific_heat": 385.0, "conductivity": 390.0, "expansion": 16.8},
 })  # fmt: skip
+
+
+def several(on: tuple[str, ...] | str | None) -> tuple[str, ...]:
+    """One place or several, as a tuple."""
+    return (on,) if isinstance(on, str) else on or ()

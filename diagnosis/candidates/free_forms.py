@@ -16,7 +16,7 @@ import numpy as np
 from data.batch import Batch
 from data.machine import Machine
 from diagnosis.contracts import Candidate, CandidateKind, Where
-from diagnosis.findings.report_data import as_given, few, listed, with_unit
+from diagnosis.formatting import as_given, few, listed, with_unit
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.free_form import REFERENCE_DEGC
 from twin.schema import MechanismPart, TwinPart

@@ -12,11 +12,10 @@ from itertools import combinations, product
 from data.machine import Machine
 from diagnosis.contracts import Candidate, Kind, Where
 from diagnosis.policy import POLICY
-from twin.compiling.cells import several
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Mechanism, PortRole, Target
 from twin.quantity import Value, same_dimension
-from twin.schema import Link, MechanismPart, TwinPart
+from twin.schema import Link, MechanismPart, TwinPart, several
 
 KIND: Mapping[Target, Kind] = {
     "node": "node", "start": "node", "surrounding": "node", "heat": "node", "link": "link", "exposure": "link",

@@ -23,8 +23,8 @@ from diagnosis.drafting.groups import Rises, Rows, rows_of
 from diagnosis.drafting.part import Sketch, moved, part_of, sketch, with_values
 from diagnosis.policy import POLICY
 from twin.calibration.estimate import free_running_rms
-from twin.calibration.fit_problem import Noise
-from twin.calibration.least_squares import State, descend, x_of
+from twin.calibration.fit_problem import Noise, x_of
+from twin.calibration.least_squares import State, descend
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.network import Network

@@ -15,8 +15,9 @@ from pydantic import BaseModel
 from data.errors import InputError, WorkError, closest
 from data.machine import Machine, parse_machine
 from data.yaml_edit import YamlText
-from diagnosis.contracts import PART_GROUPS, Fitted, with_parts, with_value
+from diagnosis.contracts import PART_GROUPS, with_parts, with_value
 from diagnosis.export.yaml_text import DIGITS, as_yaml, part_yaml, tidied
+from diagnosis.fitting.fit import Fitted
 from twin.calibration.calibrated_file import Update, held_steps, kept, put_values, with_calibrated
 from twin.calibration.identifiability import Interval
 from twin.compile import compile_network, own_paths

@@ -10,18 +10,19 @@ import pandas as pd
 
 from data.arrays import Array
 from diagnosis.candidates.free_forms import Form, phrases
-from diagnosis.contracts import Candidate, Fitted
-from diagnosis.findings.report_data import Effect, Estimate, Other, Rms, beyond_noise, context_label, place_label
+from diagnosis.contracts import Candidate
+from diagnosis.findings.report_data import Effect, Other, Rms, beyond_noise, context_label, place_label
 from diagnosis.findings.schema import Verdict
+from diagnosis.fitting.fit import Fitted
+from diagnosis.formatting import Estimate
 from diagnosis.policy import POLICY, Policy
 from diagnosis.search.claims import Explanation, Round, explanations, probability_cap, reported
 from diagnosis.search.search import Search
 from twin.calibration.identifiability import Interval
-from twin.compiling.cells import several
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import View
 from twin.quantity import Spec
-from twin.schema import MechanismPart, TwinPart
+from twin.schema import MechanismPart, TwinPart, several
 from twin.simulation import Simulation, simulate
 
 Windows = tuple[tuple[str, float, float], ...]

@@ -10,22 +10,9 @@ from collections.abc import Mapping, Sequence
 
 from data.units import unit_label
 from diagnosis.contracts import CandidateKind, Where
-from diagnosis.findings.report_data import (
-    Effect,
-    Estimate,
-    Other,
-    Rms,
-    amount,
-    as_given,
-    beyond_noise,
-    few,
-    listed,
-    of_error,
-    percent,
-    times_noise,
-    with_unit,
-)
+from diagnosis.findings.report_data import Effect, Other, Rms, beyond_noise, times_noise
 from diagnosis.findings.schema import Alternative, DetectionLimit, Finding, FittedParameter, Place, Verdict, When
+from diagnosis.formatting import Estimate, amount, as_given, few, listed, of_error, percent, with_unit
 from diagnosis.policy import POLICY
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Mechanism

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from data.arrays import Array
 from data.batch import Batch
 from diagnosis.contracts import Point
-from twin.calibration.least_squares import z_bounds
+from twin.calibration.fit_problem import z_bounds
 from twin.calibration.problem import CalibrationProblem, Nuisances
 from twin.compile import compile_network
 from twin.network import Network

@@ -15,7 +15,7 @@ from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
-from diagnosis.contracts import Fitted, Point, own_step
+from diagnosis.contracts import Point
 from diagnosis.fitting.batches import coarse, spacing_s
 from diagnosis.fitting.carried import carried_nuisances, carried_start, carried_z, on_network
 from diagnosis.fitting.covariance import (
@@ -28,23 +28,14 @@ from diagnosis.fitting.covariance import (
     rough,
     white_noise,
 )
+from diagnosis.fitting.fit import Fitted, own_step
 from diagnosis.fitting.marginal import Hyper, Marginal
+from diagnosis.fitting.signatures import imperfections, rising_films
 from diagnosis.fitting.twins import drawn_misfits
 from diagnosis.policy import POLICY
-from diagnosis.screening.signatures import imperfections, rising_films
 from twin.calibration.estimate import check_batches
-from twin.calibration.fit_problem import Block, Noise, Unknown
-from twin.calibration.least_squares import (
-    FitOptions,
-    State,
-    annealed,
-    converge,
-    likelier,
-    misfits,
-    noise_left,
-    x_of,
-    z_bounds,
-)
+from twin.calibration.fit_problem import Block, Noise, Unknown, x_of, z_bounds
+from twin.calibration.least_squares import FitOptions, State, annealed, converge, likelier, misfits, noise_left
 from twin.calibration.problem import CalibrationProblem
 from twin.calibration.recorder import converge_with_lead
 from twin.compile import compile_network

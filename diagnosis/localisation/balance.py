@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from data.arrays import Array
-from diagnosis.contracts import Fitted
+from diagnosis.fitting.fit import Fitted
 from diagnosis.policy import POLICY
 from twin.network import Reading
 from twin.simulation import Simulation, simulate

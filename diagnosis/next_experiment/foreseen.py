@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from data.arrays import Array
-from diagnosis.contracts import Fitted
+from diagnosis.fitting.fit import Fitted
 from diagnosis.next_experiment.menu import Run
 from diagnosis.policy import POLICY
 from twin.calibration.fit_problem import Block

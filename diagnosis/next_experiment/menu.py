@@ -14,7 +14,7 @@ from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine
 from data.units import quantity
-from diagnosis.findings.report_data import as_given, with_unit
+from diagnosis.formatting import as_given, with_unit
 from diagnosis.policy import POLICY
 from twin.run_plan import RunPlan
 from twin.run_plan.plan import Stage

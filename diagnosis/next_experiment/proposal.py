@@ -11,12 +11,12 @@ import pandas as pd
 
 from data.arrays import Array
 from data.errors import InputError, WorkError
-from diagnosis.contracts import Fitted, Tried
-from diagnosis.findings.report_data import few, listed
+from diagnosis.fitting.fit import Fitted
+from diagnosis.formatting import few, listed
 from diagnosis.next_experiment.foreseen import Foreseen, begun, foreseen
 from diagnosis.next_experiment.menu import Run, menu
 from diagnosis.policy import POLICY
-from diagnosis.search.claims import Round, explanations
+from diagnosis.search.claims import Round, Tried, explanations
 from diagnosis.search.search import Search
 
 NOTHING = "nothing else is missing"  # the alternative to effects that recordings leave possible

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from data.arrays import Array
-from diagnosis.contracts import Candidate, CandidateKind, Fitted
+from diagnosis.contracts import Candidate, CandidateKind
+from diagnosis.fitting.fit import Fitted
 from diagnosis.policy import POLICY
-from twin.calibration.least_squares import x_of
+from twin.calibration.fit_problem import x_of
 from twin.calibration.problem import Measured
 
 

@@ -14,11 +14,12 @@ from data.arrays import Array
 from diagnosis.candidates.alternatives import alternatives
 from diagnosis.candidates.discretisation import never_reported
 from diagnosis.candidates.library import candidates
-from diagnosis.contracts import COLUMNS, Candidate, Fitted, Scored
+from diagnosis.contracts import COLUMNS, Candidate, Scored
 from diagnosis.fitting.covariance import slices_of
+from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.marginal import TINY, Hyper
+from diagnosis.fitting.signatures import Signatures, signatures
 from diagnosis.policy import POLICY
-from diagnosis.screening.signatures import Signatures, signatures
 from twin.mechanisms import MECHANISMS
 from twin.quantity import Spec, Value, convert
 

@@ -15,9 +15,44 @@ from typing import Any
 import numpy as np
 from scipy.special import softmax
 
-from diagnosis.contracts import Fitted, Tried
+from data.arrays import Array
+from diagnosis.contracts import Candidate, Scored
+from diagnosis.fitting.fit import Fitted
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A candidate after its full refit; `gain` in nats of log evidence over the fit before.
+
+    `by_run` (B,) is what each left-out batch gains, `cluster` the first of the candidates that these recordings cannot
+    distinguish, `log_prior` of its law and of the equipment that it needs. Where it is `confirmed`, the gain is
+    the lesser under two structures: that of the fit before, and the one that is drawn anew about either fit.
+    """
+
+    scored: Scored
+    fitted: Fitted
+    gain: float
+    by_run: Array
+    cluster: str
+    log_prior: float
+    confirmed: bool = False
+
+    @property
+    def candidate(self) -> Candidate:
+        return self.scored.candidate
+
+    @property
+    def improved(self) -> int:
+        """Left-out batches that are predicted better."""
+        return int((self.by_run > 0).sum())
+
+    @property
+    def score(self) -> float:
+        """Log weight among explanations; free forms imitate any law to within a share of its gain."""
+        credit = POLICY.free_form_credit if self.candidate.kind.is_unlisted else 1.0
+        return credit * self.gain + self.log_prior
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,14 @@ from data.errors import InputError, WorkError
 from data.processes import Processes
 from diagnosis.candidates.discretisation import slack
 from diagnosis.candidates.priors import free_values, log_odds
-from diagnosis.contracts import Candidate, CandidateKind, Fitted, Scored, Tried
+from diagnosis.contracts import Candidate, CandidateKind, Scored
+from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import afresh
 from diagnosis.localisation.balance import impossible
 from diagnosis.policy import POLICY
 from diagnosis.screening.exchanged import suspected_swaps
 from diagnosis.screening.screen import Screen, one_of_each, similarity
-from diagnosis.search.claims import least_relative_gain
+from diagnosis.search.claims import Tried, least_relative_gain
 from twin.compile import own_paths
 from twin.mechanisms import MECHANISMS
 

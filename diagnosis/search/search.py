@@ -11,12 +11,13 @@ from threadpoolctl import threadpool_limits
 from data.errors import InputError, WorkError
 from data.processes import Processes
 from diagnosis.candidates.free_forms import Form, candidate_of, free_forms
-from diagnosis.contracts import Candidate, Fitted, Tried, with_parts
+from diagnosis.contracts import Candidate, with_parts
+from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import refitted, relearned, structured
 from diagnosis.localisation.balance import impossible
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, proposed, screen
-from diagnosis.search.claims import Round, figures
+from diagnosis.search.claims import Round, Tried, figures
 from diagnosis.search.refits import Progress, odds_of, refits, shortlist
 from twin.schema import TwinPart
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from data.processes import Processes
-from diagnosis.contracts import Candidate, Fitted, Where
+from diagnosis.contracts import Candidate, Where
 from diagnosis.findings.conclude import claimed_effect, rms_of, slow_residual_ratio, verdict_of
 from diagnosis.findings.report_data import Effect, rms_table
 from diagnosis.findings.schema import Findings, Verdict
 from diagnosis.fitting.covariance import independent, white_noise
+from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import left_out_rows, under
 from diagnosis.policy import POLICY, Policy
 from diagnosis.search.claims import Round, explanations

@@ -23,8 +23,8 @@ from data.errors import InputError, WorkError
 from data.machine import Machine
 from features.rises import hold_last
 from twin.calibration.arrow import Arrow, assemble
-from twin.calibration.fit_problem import Block, Noise, estimate
-from twin.calibration.least_squares import State, descend, x_of, z_bounds
+from twin.calibration.fit_problem import Block, Noise, estimate, x_of, z_bounds
+from twin.calibration.least_squares import State, descend
 from twin.calibration.problem import CalibrationProblem, Nuisances, measured
 from twin.compile import compile_network
 from twin.network import Network

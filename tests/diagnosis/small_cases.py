@@ -11,7 +11,7 @@ import numpy as np
 
 from data.batch import Batch
 from data.machine import Machine
-from diagnosis.contracts import Fitted
+from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import baseline
 from tests.twin.machines import TWO_BODIES, machine
 from tests.twin.recordings import drawn, empty_batches, recorded

@@ -17,9 +17,9 @@ from data.registry import Registry
 from diagnosis.candidates.alternatives import alternatives
 from diagnosis.candidates.library import HINTS, candidates, equipment_named, linked, log_prior_odds
 from diagnosis.contracts import Candidate, Where
+from diagnosis.fitting.signatures import differences, with_disabled
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import proposed
-from diagnosis.screening.signatures import differences, with_disabled
 from diagnosis.search.search import search
 from tests.diagnosis.small_cases import equipped, fitted, four_bodies, runs, two_bodies
 from twin.compile import compile_network

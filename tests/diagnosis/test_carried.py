@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from data.arrays import Array
-from diagnosis.contracts import Fitted
 from diagnosis.fitting.carried import carried_nuisances, carried_z, on_network
+from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import refitted
 from tests.diagnosis.small_cases import fitted, runs, two_bodies
-from twin.calibration.least_squares import x_of
+from twin.calibration.fit_problem import x_of
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.quantity import Value

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from diagnosis.contracts import Candidate, Scored, Tried, Where
+from diagnosis.contracts import Candidate, Scored, Where
 from diagnosis.policy import POLICY
 from diagnosis.search.claims import (
     Figures,
     Round,
+    Tried,
     differs,
     explanations,
     figures,

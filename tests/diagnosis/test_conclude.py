@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from diagnosis.contracts import Candidate, Fitted, Scored, Where
+from diagnosis.contracts import Candidate, Scored, Where
 from diagnosis.findings.conclude import (
     activity,
     moved_rms,
@@ -21,6 +21,7 @@ from diagnosis.findings.conclude import (
     verdict_of,
 )
 from diagnosis.findings.report_data import Effect, Rms
+from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import refitted
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import proposed

@@ -11,7 +11,7 @@ from data.arrays import Array
 from data.machine import Machine
 from diagnosis.candidates.library import candidates
 from diagnosis.contracts import Candidate, Where
-from diagnosis.screening.signatures import with_disabled
+from diagnosis.fitting.signatures import with_disabled
 from tests.diagnosis.small_cases import driven, equipped, four_bodies, two_bodies
 from twin.compile import compile_network
 from twin.mechanisms import MECHANISMS

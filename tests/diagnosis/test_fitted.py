@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from data.arrays import Array
-from diagnosis.contracts import Fitted
+from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import (
     LeftOutRows,
     afresh,

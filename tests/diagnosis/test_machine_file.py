@@ -16,9 +16,9 @@ import yaml
 
 from data.errors import InputError, WorkError
 from data.machine import parse_machine
-from diagnosis.contracts import Fitted
 from diagnosis.export import machine_file
 from diagnosis.export.machine_file import changed_parts, deviations, diagnosed_text, drafted_text, with_deviations
+from diagnosis.fitting.fit import Fitted
 from tests.diagnosis.small_cases import FLOOR, fitted, runs, two_bodies
 from twin.calibration.calibrated_file import calibrated_text
 from twin.calibration.identifiability import Interval

@@ -9,11 +9,12 @@ import pytest
 
 from diagnosis.candidates.library import candidates
 from diagnosis.candidates.priors import at_size, free_values, size_of
-from diagnosis.contracts import Fitted, Scored
+from diagnosis.contracts import Scored
 from diagnosis.fitting.carried import carried_start
+from diagnosis.fitting.fit import Fitted
 from diagnosis.policy import POLICY
 from tests.diagnosis.small_cases import FLOOR, cold_floor, four_bodies
-from twin.calibration.least_squares import x_of
+from twin.calibration.fit_problem import x_of
 from twin.compile import compile_network
 from twin.mechanisms import MECHANISMS
 from twin.quantity import Value, convert

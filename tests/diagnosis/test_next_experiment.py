@@ -15,13 +15,14 @@ import pytest
 from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine, load_machine
-from diagnosis.contracts import Candidate, Fitted, Point, Scored, Tried, Where
+from diagnosis.contracts import Candidate, Point, Scored, Where
+from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import calibrated
 from diagnosis.next_experiment.foreseen import AlternativeModel, begun, foreseen, with_free_offset
 from diagnosis.next_experiment.menu import Run, menu
 from diagnosis.next_experiment.proposal import COLUMNS, NOTHING, Proposal, next_experiment, revealing_run
 from diagnosis.policy import POLICY
-from diagnosis.search.claims import Round, figures
+from diagnosis.search.claims import Round, Tried, figures
 from diagnosis.search.search import Search
 from tests.diagnosis.concealed import chain, empty
 from tests.twin.machines import machine

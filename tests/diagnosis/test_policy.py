@@ -29,7 +29,7 @@ NO_DECISION = {
     "localisation/linearised.py": {"MAX_MODAL_VALUES"},
     "localisation/where_when.py": {"CLOCK_EDGES_H", "MAX_DRIVER_LEVELS", "SINCE_START_EDGES_MIN"},
     "screening/screen.py": {"NO_TRACE"},
-    "screening/signatures.py": {"EVEN_STEPS", "NEARLY_OFF"},
+    "fitting/signatures.py": {"EVEN_STEPS", "NEARLY_OFF"},
 }  # fmt: skip
 
 

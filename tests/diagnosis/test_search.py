@@ -12,7 +12,7 @@ import pytest
 from data.errors import InputError, WorkError
 from data.processes import Processes
 from diagnosis.candidates.discretisation import never_reported, slack
-from diagnosis.contracts import Fitted
+from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import degraded_channels, deterministic_fit, left_out_rows
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import proposed

@@ -15,18 +15,7 @@ import pytest
 
 from data.machine import load_machine
 from diagnosis.contracts import Kind, Where
-from diagnosis.findings.report_data import (
-    Effect,
-    Estimate,
-    Other,
-    Rms,
-    amount,
-    as_given,
-    context_label,
-    few,
-    percent,
-    place_label,
-)
+from diagnosis.findings.report_data import Effect, Other, Rms, context_label, place_label
 from diagnosis.findings.schema import DetectionLimit, Place
 from diagnosis.findings.statement import (
     build_finding,
@@ -36,6 +25,7 @@ from diagnosis.findings.statement import (
     statement,
     verdict_statement,
 )
+from diagnosis.formatting import Estimate, amount, as_given, few, percent
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Mechanism, Target
 from twin.quantity import Spec

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from data.machine import Machine
-from diagnosis.contracts import Fitted
 from diagnosis.diagnose import diagnose
 from diagnosis.drafting.draft import drafted_part
 from diagnosis.findings.schema import Findings
+from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import baseline, relearned
 from diagnosis.localisation.where_when import FoundPlace, Located, locate
 from diagnosis.result import Diagnosis

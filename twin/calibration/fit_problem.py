@@ -57,6 +57,18 @@ class Unknown:
         return float(expit(x)) if self.scale == "logit" else float(x)
 
 
+def x_of(unknowns: Sequence[Unknown], z: Array) -> Array:
+    """Fitting coordinates x (p,) at z (p,), never outside the bounds by rounding."""
+    prior, spread, low, high = np.array([(u.prior, u.spread, u.low, u.high) for u in unknowns]).reshape(-1, 4).T
+    return np.clip(prior + spread * z, low, high)
+
+
+def z_bounds(unknowns: Sequence[Unknown]) -> tuple[Array, Array]:
+    """Lower and upper bounds in z, (p,) each."""
+    low = np.array([(u.low - u.prior) / u.spread for u in unknowns])
+    return low, np.array([(u.high - u.prior) / u.spread for u in unknowns])
+
+
 @dataclass(frozen=True)
 class Block:
     """One batch, whitened (divided by the noise's standard deviation), rows in time order within each channel.

@@ -17,7 +17,7 @@ from threadpoolctl import ThreadpoolController
 from data.arrays import Array
 from data.errors import InputError, WorkError
 from twin.calibration.arrow import Arrow, assemble
-from twin.calibration.fit_problem import Block, Noise, Problem, Unknown, estimate
+from twin.calibration.fit_problem import Block, Noise, Problem, Unknown, estimate, x_of, z_bounds
 
 MOST_DAMPING = 1e12
 
@@ -80,18 +80,6 @@ class State:
         """True if the expected gain of a further step is below the tolerance."""
         dof = max(1.0, self.rows - self.arrow.effective_parameters())
         return self.expected <= tolerance * max(1.0, self.cost / dof)
-
-
-def x_of(unknowns: Sequence[Unknown], z: Array) -> Array:
-    """Fitting coordinates x (p,) at z (p,), never outside the bounds by rounding."""
-    prior, spread, low, high = np.array([(u.prior, u.spread, u.low, u.high) for u in unknowns]).reshape(-1, 4).T
-    return np.clip(prior + spread * z, low, high)
-
-
-def z_bounds(unknowns: Sequence[Unknown]) -> tuple[Array, Array]:
-    """Lower and upper bounds in z, (p,) each."""
-    low = np.array([(u.low - u.prior) / u.spread for u in unknowns])
-    return low, np.array([(u.high - u.prior) / u.spread for u in unknowns])
 
 
 def descend(problem: Problem, state: State, max_iterations: int, tolerance: float) -> State:

@@ -125,10 +125,6 @@ class Scope:
         return {name: k for k, name in enumerate(self.part.surroundings)}
 
 
-def several(on: tuple[str, ...] | str | None) -> tuple[str, ...]:
-    return (on,) if isinstance(on, str) else on or ()
-
-
 def number(key: str, given: str | float, unit: str) -> float:
     try:
         value = convert(given, unit)

@@ -11,13 +11,13 @@ import numpy as np
 
 from data.arrays import Array
 from data.errors import closest
-from twin.compiling.cells import Scope, number, several
+from twin.compiling.cells import Scope, number
 from twin.compiling.parameters import LENGTH, MATERIAL, OFFSET, SHARE, TEMPERATURE
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Mechanism
 from twin.network import CompiledSurrounding, ErrorRow, Heat, Law, Outlet, Port, Reading
 from twin.quantity import Monomial, Spec, Value, same_dimension
-from twin.schema import ChainLink, ErrorChain, MechanismPart, Sensor, Surrounding, Tilt
+from twin.schema import ChainLink, ErrorChain, MechanismPart, Sensor, Surrounding, Tilt, several
 
 
 def mechanism_of(name: str, given: MechanismPart) -> Mechanism:

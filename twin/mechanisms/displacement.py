@@ -14,10 +14,9 @@ import numpy as np
 
 from data.arrays import Numeric
 from data.errors import closest
-from twin.compiling.cells import several
 from twin.mechanisms.base import Mechanism, PortRole, View, real
 from twin.quantity import Spec, Value
-from twin.schema import Body, ChainLink, Exposure, Link, MechanismPart, Tilt, TwinPart
+from twin.schema import Body, ChainLink, Exposure, Link, MechanismPart, Tilt, TwinPart, several
 
 
 class ColumnBending(Mechanism):

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from data.arrays import Numeric
 from data.errors import closest
-from twin.compiling.cells import several
 from twin.mechanisms.base import Mechanism, PortRole, View, real
 from twin.quantity import Spec
-from twin.schema import MechanismPart, TwinPart
+from twin.schema import MechanismPart, TwinPart, several
 
 
 class SensorLag(Mechanism):

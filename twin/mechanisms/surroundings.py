@@ -12,10 +12,9 @@ import numpy as np
 
 from data.arrays import Numeric
 from data.errors import closest
-from twin.compiling.cells import several
 from twin.mechanisms.base import Mechanism, PortRole, View
 from twin.quantity import Spec
-from twin.schema import Body, Exposure, MechanismPart, Surrounding, TwinPart
+from twin.schema import Body, Exposure, MechanismPart, Surrounding, TwinPart, several
 
 
 class EnclosureAir(Mechanism):

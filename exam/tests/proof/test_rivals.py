@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from diagnosis.candidates.priors import free_values
-from diagnosis.screening.signatures import difference
+from diagnosis.fitting.signatures import difference
 from diagnosis.search.search import Search, search
 from tests.diagnosis.small_cases import cold_floor, consistent
 from thermodrift_rivals import baselines, replies

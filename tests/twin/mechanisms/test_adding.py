@@ -13,7 +13,7 @@ import pytest
 import signatures_heat
 
 from diagnosis.candidates.library import candidates
-from diagnosis.screening.signatures import with_disabled
+from diagnosis.fitting.signatures import with_disabled
 from tests.contracts import test_mechanism_contract as contract
 from tests.toys.small_machine import BODIES, machine_with
 from twin.mechanisms import MECHANISMS

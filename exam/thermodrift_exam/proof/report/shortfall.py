@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-from diagnosis.findings.report_data import percent
+from diagnosis.formatting import percent
 from reports.labels import NOTHING, count, number
 from reports.layout import Column, Row, Table
 from thermodrift_exam.proof.report.labels import key_label, plant_letter, plant_origin, simulated

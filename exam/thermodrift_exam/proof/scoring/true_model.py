@@ -20,10 +20,11 @@ from data.errors import InputError, WorkError
 from data.machine import Machine
 from diagnosis.candidates.free_forms import BODY_PARAMETERS, Form, Level, candidate_of
 from diagnosis.candidates.priors import free_values
-from diagnosis.contracts import Candidate, Fitted, Scored, Where
+from diagnosis.contracts import Candidate, Scored, Where
 from diagnosis.drafting.draft import drafted_part
 from diagnosis.findings.conclude import reported_parameters
 from diagnosis.fitting.batches import enough_batches, usable_batches
+from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import afresh, baseline, left_out_rows, refitted
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, proposed, screen

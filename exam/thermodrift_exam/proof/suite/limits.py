@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 from data.arrays import Array
 from data.batch import Batch
 from data.files import write_atomic
-from diagnosis.contracts import Fitted
+from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import baseline
 from diagnosis.search.claims import least_relative_gain
 from thermodrift_exam.plants.effects import EFFECTS

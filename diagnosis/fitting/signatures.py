@@ -20,14 +20,13 @@ from diagnosis.candidates.discretisation import SLACK_MECHANISMS, films_that_ris
 from diagnosis.candidates.library import candidates
 from diagnosis.contracts import Candidate, CandidateKind, Point
 from diagnosis.fitting.carried import carried_nuisances, carried_z, on_network
-from twin.calibration.least_squares import x_of
+from twin.calibration.fit_problem import x_of
 from twin.compile import compile_network
-from twin.compiling.cells import several
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import View
 from twin.network import Heat, Law, Network
 from twin.quantity import Parameter, Value, convert
-from twin.schema import TwinPart
+from twin.schema import TwinPart, several
 from twin.simulation import Simulation, simulate
 
 AMPLITUDE_OF = "candidate "  # a parameter's source that says whose amplitude it is
