@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -37,7 +36,7 @@ from twin.calibration.estimate import check_batches
 from twin.calibration.fit_problem import Block, Noise, Unknown, x_of, z_bounds
 from twin.calibration.least_squares import FitOptions, State, annealed, converge, likelier, misfits, noise_left
 from twin.calibration.problem import CalibrationProblem
-from twin.calibration.recorder import converge_with_lead
+from twin.calibration.recorder import converge_with_lead, first_lead_rows
 from twin.compile import compile_network
 from twin.schema import TwinPart
 from twin.simulation.inputs import acting
@@ -88,12 +87,14 @@ def baseline(
 
 
 def lead_of(machine: Machine, part: TwinPart, batches: Sequence[Batch]) -> float:
-    """By how many rows a driver's change comes before the row that first shows it, as the machine file states or as is
-    likeliest with a twin part. Effects that the part lacks may make another one likelier.
+    """By how many rows a driver's change comes before the row that first shows it: as the machine file states, or as is
+    likeliest with a twin part. Effects that the part lacks may make another lead likelier.
 
     Raises:
         InputError, WorkError: as `baseline`.
     """
+    if machine.recording.drivers is not None:
+        return first_lead_rows(machine)
     return _calibrated_first(machine, part, batches).lead_rows
 
 
@@ -151,37 +152,30 @@ def on_all_rows(fitted: Fitted, batches: Sequence[Batch]) -> Fitted:
 
 
 def relearned(fitted: Fitted) -> Fitted:
-    """The fit at its optimum, all derivatives taken anew, under the hyperparameters and the noise of every channel that
-    are likeliest now: those of the fit before may have stood in for an effect."""
+    """The fit at its optimum under the hyperparameters and channel noise that are likeliest now: those of the fit
+    before may have imitated an effect."""
     done = replace(_under_own(fitted, fitted, fitted.hyper), base=fitted.base)
     return done if done.log_evidence > fitted.log_evidence else fitted
 
 
-def refitted(now: Fitted, part: TwinPart) -> Fitted:
-    """The recordings of a fit explained by a changed twin part, from the values of the fit on: another optimum than
-    `afresh` may find.
+def refitted(now: Fitted, part: TwinPart, fresh: bool = False) -> Fitted:
+    """The fit of a changed twin part to the same recordings.
+
+    The descent begins at the values of the fit or, with `fresh`, at those of the machine file: the values of a fit that
+    lacks an effect imitate it, and a descent from there may not leave them. The two may end at different optima.
 
     Raises:
-        InputError: the part does not compile; WorkError: it cannot be simulated there.
+        InputError: the part does not compile; WorkError: it cannot be simulated where the descent begins.
     """
-    problem, z, nuisance = carried_start(now, part)
+    if fresh:
+        problem = on_network(now.problem, now.batches, compile_network(now.machine, part=part), free_starts=True)
+        options, noise = _first_calibration(len(problem.channels))
+        state, _ = converge(problem, options, noise=noise)
+        z, nuisance, hyper = state.z, state.nuisance, Hyper(*POLICY.first_hyper)
+    else:
+        (problem, z, nuisance), hyper = carried_start(now, part), now.hyper
     at = Point(now.machine, part, now.batches, problem, z, nuisance, now.lead_rows)
-    return replace(_under_own(now, at, now.hyper), base=now)
-
-
-def afresh(now: Fitted, part: TwinPart) -> Fitted:
-    """The recordings of a fit explained by a changed twin part, from the values of the machine file on.
-
-    The values of a fit that lacks an effect stand in for it. A descent that begins there may end where they still do.
-
-    Raises:
-        InputError: the part does not compile; WorkError: the model fails at the priors' means.
-    """
-    problem = on_network(now.problem, now.batches, compile_network(now.machine, part=part), free_starts=True)
-    options, noise = _first_calibration(len(problem.channels))
-    state, _ = converge(problem, options, noise=noise)
-    at = Point(now.machine, part, now.batches, problem, state.z, state.nuisance, now.lead_rows)
-    return replace(_under_own(now, at, Hyper(*POLICY.first_hyper)), base=now)
+    return replace(_under_own(now, at, hyper), base=now)
 
 
 def _under_own(now: Fitted, at: Point, begin: Hyper) -> Fitted:
@@ -286,11 +280,8 @@ def _begun(at: Point, covariance: Covariance, hyper: Hyper, runs: int) -> Fitted
     """A point under a covariance as it is; all that acts linearly is linearised there."""
     blocks = list(at.problem.linearise(at.x, at.nuisance))
     marginal = _marginal(covariance, blocks, at)
-    return Fitted(**_fields(at), marginal=marginal, hyper=hyper, columns=_columns(marginal, blocks, at), runs=runs)
-
-
-def _fields(at: Point) -> dict[str, Any]:
-    return {f.name: getattr(at, f.name) for f in fields(Point)}
+    given = {f.name: getattr(at, f.name) for f in fields(Point)}
+    return Fitted(**given, marginal=marginal, hyper=hyper, columns=_columns(marginal, blocks, at), runs=runs)
 
 
 def under(fitted: Fitted, covariance: Covariance) -> Fitted:
@@ -385,7 +376,8 @@ def deterministic_fit(fitted: Fitted) -> Fitted:
     if misfits(noise_left(problem, state)):
         with suppress(WorkError, InputError):  # no machine has such values
             state = likelier(problem, state, _elsewhere(fitted))
-    return calibrated(_moved(fitted, state), state.noise, fitted.runs)
+    at = Point(fitted.machine, fitted.part, fitted.batches, problem, state.z, state.nuisance, fitted.lead_rows)
+    return calibrated(at, state.noise, fitted.runs)
 
 
 def _elsewhere(fitted: Fitted) -> State:
@@ -398,10 +390,6 @@ def _elsewhere(fitted: Fitted) -> State:
     z = carried_z(one.problem, problem, one.z, fitted.z)
     state = State.at(problem, z, carried_nuisances(one.problem, problem, one.nuisance), one.noise)
     return annealed(problem, state, POLICY.deterministic_steps, tolerance)
-
-
-def _moved(at: Point, state: State) -> Point:
-    return Point(at.machine, at.part, at.batches, at.problem, state.z, state.nuisance, at.lead_rows)
 
 
 def calibrated(at: Point, noise: Noise, runs: int = 0) -> Fitted:

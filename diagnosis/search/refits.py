@@ -12,7 +12,7 @@ from diagnosis.candidates.discretisation import slack
 from diagnosis.candidates.priors import free_values, log_odds
 from diagnosis.contracts import Candidate, CandidateKind, Scored
 from diagnosis.fitting.fit import Fitted
-from diagnosis.fitting.fitted import afresh
+from diagnosis.fitting.fitted import refitted
 from diagnosis.localisation.balance import impossible
 from diagnosis.policy import POLICY
 from diagnosis.screening.exchanged import suspected_swaps
@@ -82,25 +82,16 @@ def refits(
     for n, (s, fitted) in enumerate(zip(work, workers.map(partial(refit, now), work), strict=True)):
         report("refit", n + 1, len(work))
         if fitted is not None and not _usual(s.candidate, fitted, sizes):
-            c = s.candidate
-            gain = fitted.log_evidence - now.log_evidence
-            out.append(
-                Tried(
-                    s,
-                    fitted,
-                    gain,
-                    fitted.log_predictive_density - now.log_predictive_density,
-                    clusters.get(c.name, c.name),
-                    odds.get(c.name, 0.0),
-                )
-            )
+            name, gain = s.candidate.name, fitted.log_evidence - now.log_evidence
+            by_run = fitted.log_predictive_density - now.log_predictive_density
+            out.append(Tried(s, fitted, gain, by_run, clusters.get(name, name), odds.get(name, 0.0)))
     return sorted(out, key=lambda t: -t.score)
 
 
 def refit(now: Fitted, s: Scored) -> Fitted | None:
     """A fit with one candidate more; None where it cannot be simulated."""
     try:
-        return afresh(now, s.candidate.applied(now.part, free_values(s, now)))
+        return refitted(now, s.candidate.applied(now.part, free_values(s, now)), fresh=True)
     except (InputError, WorkError):
         return None
 

@@ -13,7 +13,6 @@ from data.arrays import Array
 from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import (
     LeftOutRows,
-    afresh,
     deterministic_fit,
     left_out_rows,
     refitted,
@@ -89,7 +88,7 @@ def test_a_better_part_leaves_less_noise() -> None:
 
 
 def test_from_the_files_values_it_is_found_as_from_those_of_a_fit() -> None:
-    done, other = with_the_floor(), afresh(cold_floor(), with_floor(cold_floor().part))
+    done, other = with_the_floor(), refitted(cold_floor(), with_floor(cold_floor().part), fresh=True)
     assert other.log_evidence == pytest.approx(done.log_evidence, abs=2.0)
     assert np.abs(other.z - done.z).max() < 0.3
     assert np.abs(relinearised(done).z - done.z).max() < 0.1

@@ -147,12 +147,12 @@ def test_two_heats_of_one_mechanism_at_one_body_are_two_terms() -> None:
 
 
 def test_what_cannot_be_simulated_is_neither_visible_nor_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    def stiff(*_: Any) -> None:
+    def stiff(*_: Any, **_given: Any) -> None:
         raise InputError("stiff beyond the step control")
 
     known = two_bodies()
     hidden = {"floor": {**FLOOR, "parameters": {"conductance": "8 W/K"}}}
-    monkeypatch.setattr(module, "afresh", stiff)
+    monkeypatch.setattr(module, "refitted", stiff)
     assert true_model(known, runs(known, hidden), answer("one", floor(8.0))).visible == (None,)
 
 

@@ -25,7 +25,7 @@ from diagnosis.drafting.draft import drafted_part
 from diagnosis.findings.conclude import reported_parameters
 from diagnosis.fitting.batches import enough_batches, usable_batches
 from diagnosis.fitting.fit import Fitted
-from diagnosis.fitting.fitted import afresh, baseline, left_out_rows, refitted
+from diagnosis.fitting.fitted import baseline, left_out_rows, refitted
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, proposed, screen
 from thermodrift_exam.proof.scoring.answer_key import AnswerKey, Spot, TrueTerm
@@ -206,7 +206,7 @@ def _with(fit: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None]
     """The fit with the stated terms, fitted as a diagnosis fits an explanation. None where it cannot be simulated."""
     own = [(t, s) for t, s in zip(terms, found, strict=True) if s is not None]
     try:
-        return afresh(fit, with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit))
+        return refitted(fit, with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit), fresh=True)
     except (InputError, WorkError, ValueError):  # ValueError: one candidate twice
         return None
 
@@ -221,7 +221,7 @@ def _judged(
     own = [(t, o) for k, (t, o) in enumerate(zip(terms, found, strict=True)) if k != which and o is not None]
     part = with_terms(fit.part, [t for t, _ in own], [o for _, o in own], fit)
     try:
-        without = [refitted(full, part).log_evidence, (afresh(fit, part) if own else fit).log_evidence]
+        without = [refitted(full, part).log_evidence, (refitted(fit, part, fresh=True) if own else fit).log_evidence]
     except (InputError, WorkError):
         return _Judged()
     gain = full.log_evidence - max(without)
