@@ -107,7 +107,7 @@ class CandidateKind(StrEnum):
 
     @property
     def is_unlisted(self) -> bool:
-        """Whether it stands in for physics that no listed mechanism describes."""
+        """Whether it represents physics that no listed mechanism describes."""
         return self in (CandidateKind.FREE_FLUX, CandidateKind.FREE_SHIFT, CandidateKind.UNLISTED)
 
 
@@ -223,7 +223,7 @@ class Point:
         return np.bincount(every, minlength=len(self.problem.channels)).astype(float)
 
 
-# Left-out values throughout. kind and name: where, as in the findings; a candidate's unique name may stand there too.
+# Left-out values throughout. kind and name: where, as in the findings; or a candidate's unique name.
 # Errors less their first sample, sensors in degC; gain in nats of left-out log score.
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "rms": ("batch", "channel", "unit", "rows", "before", "after", "floor"),

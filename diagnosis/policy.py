@@ -53,7 +53,7 @@ class Policy:
         (0.7, 0.7), "of what leaves the body, median; log sd", "castings have Biot numbers about 1"
     )
     thin_body_share: float = physical(0.25, "probability", "screws and sheets conduct far less than they exchange")
-    thin_body_conductance: tuple[float, float] = physical((0.1, 1.0), "as above", "of such a body")
+    thin_body_conductance: tuple[float, float] = physical((0.1, 1.0), "as above", "of a thin body")
     webbed_share: float = physical(0.5, "probability", "ribs and webs conduct around a chain")
     web_conductance: tuple[float, float] = physical(
         (0.1, 1.0), "of the inner conductance", "each, from weak to as good as the chain"
@@ -95,7 +95,7 @@ class Policy:
     damping_factor: float = convention(6.0, "factor", "from one shorter step to the next")
 
     # Imperfections of any machine
-    sensor_place_sd: float = physical(0.1, "of a neighbour's lead", "a sensor in a casting stands in a gradient")
+    sensor_place_sd: float = physical(0.1, "of a neighbour's lead", "a sensor in a casting is in a gradient")
     chain_span_sd: float = physical(0.15, "of a length", "a length of an error chain spans a part of its body")
     small_body_span_sd: float = physical(0.5, "of a length", "its ends are as far apart as its neighbours")
     outside_body_sd: float = physical(0.1, "of the largest gain", "bodies outside an error chain tilt it a little")
@@ -190,7 +190,7 @@ class Policy:
     place_min_evidence_share: float = analytic(0.01, "of the first place", "hats and linearisation may leave as much")
     rough_amplitude_margin_nats: float = cost(200.0, "nats", "what a rough amplitude may cost a place")
     place_noise_rounds: int = cost(5, "rounds", "of the noise with all places held")
-    linear_step_max_sd: float = analytic(3.0, "prior sd", "beyond it a linearised model says little")
+    linear_step_max_sd: float = analytic(3.0, "prior sd", "beyond it a linearised model is inaccurate")
     linear_step_converged_sd: float = analytic(0.3, "prior sd", "parameters that move less are where they were")
     linearisations: int = cost(3, "linearisations", "beyond them places and series hardly change")
     located_places: int = cost(3, "places", "that are located one after the other")
@@ -205,7 +205,7 @@ class Policy:
     sensor_cost_h: float = physical(2.0, "h", "to mount one more sensor")
     prediction_max_refinement: int = cost(2, "steps per row", "both sides of a comparison share the simulation's error")
     extra_sensor_offset_sd_K: float = physical(0.3, "K", "of one more sensor")
-    extra_sensor_noise_K: float = physical(0.1, "K", "of one more sensor, where no other says what is usual")
+    extra_sensor_noise_K: float = physical(0.1, "K", "of one more sensor, where no other shows the usual value")
     short_recording_h: float = convention(3.0, "h", "after shorter recordings runs are shorter in proportion")
     slow_run_speed_share: float = physical(0.2, "of the highest speed", "little friction heat, but convection")
     staircase_speed_shares: tuple[float, ...] = physical(
@@ -238,7 +238,7 @@ class Policy:
     draft_equal_capacity_weight: float = convention(
         0.3, "weight", "of equal capacities against the ratios that links give"
     )
-    draft_max_log_capacity_ratio: float = convention(4.0, "log", "what one link may say of two capacities")
+    draft_max_log_capacity_ratio: float = convention(4.0, "log", "of two capacities, by one link")
     draft_held_heat_W: float = physical(300.0, "W", "spindles of some kilowatts lose a few hundred watts")
     draft_heat_log_sd: float = physical(1.0, "log", "prior of a drafted heat")
     draft_speed_exponent: float = physical(1.5, "power of speed", "friction and windage grow as n^1 to n^2.5")
@@ -255,7 +255,7 @@ class Policy:
     draft_held_capacity_J_per_K: float = physical(10e3, "J/K", "held where nothing heats")
     draft_gain_sd_um_per_K: float = physical(10.0, "um/K", "prior of an error chain's gain")
     draft_start_sd_K: float = physical(0.5, "K", "of a body's start")
-    draft_offset_sd_K: float = physical(0.5, "K", "of a sensor, beyond what first readings say")
+    draft_offset_sd_K: float = physical(0.5, "K", "of a sensor, beyond its first readings")
     draft_folds: int = cost(4, "folds", "parts that are left out in turn")
     draft_misfit_share: float = development(0.1, "of the movement", "residual of a drafted network; weights the rows")
     draft_rows_per_value: float = development(10.0, "rows", "so many rows of a smooth misfit count as one")
@@ -277,7 +277,7 @@ class Policy:
         6.0, "structural errors", "267 complete cases left 1.5 in the median, 5.1 at most"
     )
     few_runs_residual_max_units: float = development(4.0, "structural errors", "few runs prove less")
-    few_runs: int = convention(6, "runs", "below it runs are few, and a finding says so")
+    few_runs: int = convention(6, "runs", "below it a finding states that runs are few")
     lumped_amplitude_sd: float = development(
         0.5, "of an amplitude", "with it 207 of 231 intervals held the true amplitude"
     )
@@ -288,7 +288,7 @@ class Policy:
     likely_probability: float = convention(0.6, "probability", "above it a claim is most likely, below it perhaps")
     reduced_max_share: float = convention(0.98, "of the error before", "an error that keeps more is not reduced")
     noise_max_ratio: float = convention(1.5, "times the given noise", "a channel up to it is noise")
-    limit_power_sd: float = analytic(1.64, "sd", "an effect at its limit is seen in 95 of 100 such sets of runs")
+    limit_power_sd: float = analytic(1.64, "sd", "an effect at its limit is detected in 95 of 100 sets of runs")
     limit_absorbed_share: float = convention(0.3, "of a signature", "from it on the hiding parameter is named")
 
     # Rules that an ablation takes out

@@ -173,7 +173,7 @@ def _driven(where: Where, drivers: Sequence[Level]) -> Iterator[Form]:
 
 
 def levels(batches: Sequence[Batch]) -> Iterator[Level]:
-    """The drivers that every recording has and that do not stand still."""
+    """The drivers that every recording has and that change."""
     for name, channel in batches[0].channels.items():
         if channel.role != "driver" or not all(name in b.table.columns for b in batches):
             continue

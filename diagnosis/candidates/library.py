@@ -43,7 +43,7 @@ HINTS: Mapping[str, tuple[str, ...]] = {
     "window": ("window", "fenster", "sun", "sonne", "skylight", "oberlicht"),
 }
 
-# What a driver implies: parts that turn stand in bearings and have a motor, axes that move have guides and screws, and
+# What a driver implies: parts that turn have bearings and a motor, axes that move have guides and screws, and
 # every machine with a control has its cabinet. What moves is measured against a bar or a fixture.
 BY_SPEED = frozenset({"rotating parts", "bearings", "motor", "belt", "cutting", "cabinet", "test bar"})
 BY_FEED = frozenset({"guides", "ball screw", "motor", "cutting", "cabinet", "test bar"})
@@ -172,7 +172,7 @@ def _variants(c: Candidate, mechanism: type[Mechanism]) -> Iterator[Candidate]:
     """The candidate begun at every value at which it is looked for.
 
     What happens at another time has no trace yet, and a floor at the temperature of a body takes no heat from it: the
-    amplitude is screened at each value. Where the value itself is the amplitude (a lag, a clock's skew) no slope says
+    amplitude is screened at each value. Where the value itself is the amplitude (a lag, a clock's skew) no slope shows
     what a large one does: each is a finite change, without amplitudes, and its value is free in a fit.
     """
     yield c
@@ -195,7 +195,7 @@ def _variants(c: Candidate, mechanism: type[Mechanism]) -> Iterator[Candidate]:
 
 
 def _of_ports(mechanism: type[Mechanism], ports: Mapping[str, str]) -> dict[str, Value]:
-    """Values that go with the optional ports named: coolant that is said to follow a room follows it entirely."""
+    """Values that go with the optional ports named: coolant that follows a room follows it entirely."""
     named = {p: value for p, (port, value) in mechanism.of_port.items() if port in ports and value is not None}
     return {p: _fixed(mechanism, p, value) for p, value in named.items()}
 
@@ -220,7 +220,7 @@ def _words(mechanism: type[Mechanism], site: Site, also: Sequence[str]) -> str:
 def _sites(part: TwinPart, mechanism: type[Mechanism], target: Target) -> list[Site]:
     kind = KIND[target]
     if target == "exposure" and "surrounding" in mechanism.acts_at and "expand" in mechanism.effects():
-        return []  # it stands between a surrounding and all that it surrounds
+        return []  # it is between a surrounding and all that it surrounds
     if target in ("node", "start"):
         return [Site(kind, name) for name in list(part.bodies)]
     if target == "heat":

@@ -149,7 +149,7 @@ def drafted_part(
 ) -> Drafted:
     """The simplest network of at most `max_bodies` bodies that the recordings support.
 
-    Temperatures determine ratios alone: one heat is held at a round value (or, without any, one capacity), and every
+    Temperatures determine only ratios: one heat is held at a round value (or, without any, one capacity), and every
     other W, W/K and J/K is relative to it. Values are fitted, spreads wide; the machine file's twin part is not read.
 
     Raises:
@@ -233,7 +233,7 @@ def _words(rows: Rows, chosen: _Tried, heats: Sequence[Driven]) -> tuple[str, ..
     if drawn.held is not None:
         heat = drawn.heats[drawn.held]
         held = f"{POLICY.draft_held_heat_W:g} W at {heat.top:g} {heat.unit}"
-        scale = f"temperatures determine ratios alone: {heat.name} is held at {held}"
+        scale = f"temperatures determine only ratios: {heat.name} is held at {held}"
     else:
         why = "no recorded driver heats it" if not drawn.heats else "no heat could be held"
         scale = f"{why}: the capacity of {drawn.names[0]} is held at {POLICY.draft_held_capacity_J_per_K / 1e3:g} kJ/K"

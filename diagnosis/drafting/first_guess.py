@@ -55,7 +55,7 @@ class Guess:
 
 
 def guess(balance: Balance, links: Sequence[tuple[int, int]]) -> Guess:
-    """What the integrated balances say, values that they leave at 0 put within what recordings can show."""
+    """Estimates of the integrated balances, with values of 0 moved within what recordings can show."""
     count = balance.body_degC.shape[1]
     rate = np.zeros((count, count))  # 1/s: how fast body k follows body j
     to_room = np.zeros(count)

@@ -1,4 +1,4 @@
-"""Temperatures that move together: which sensors one body can stand for, and what that body does."""
+"""Temperatures that move together: which sensors one body can represent, and its temperature."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def _cut(batch: Batch, each: int) -> list[Batch]:
 
 
 def _thinned(batch: Batch, step_s: float) -> Batch:
-    """Every k-th row: drivers and ambients as means, holes filled; readings as they stand, or the next one's."""
+    """Every k-th row: drivers and ambients as means, holes filled; readings as they are, or the next one's."""
     k = max(1, round(step_s / batch.step_s))
     at = np.arange(0, batch.n_rows, k)
     table: dict[str, Array] = {"time_s": batch.time_s[at]}
@@ -173,7 +173,7 @@ def _thinned(batch: Batch, step_s: float) -> Batch:
 def _noise(machine: Machine, batches: Sequence[Batch], name: str, drivers: Mapping[str, float]) -> float:
     """Sd of a channel: its resolution's rounding error, or where none is stated from differences while at rest.
 
-    Differences of the order that leaves least: what warms smoothly cancels, noise does not. What is shown in steps has
+    Differences of the order with the least residual: smooth warming cancels, noise does not. What is shown in steps has
     at least a step's rounding error.
     """
     channel = machine.channels[name]

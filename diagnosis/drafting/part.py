@@ -120,7 +120,7 @@ def _second(distance: Array, links: Sequence[tuple[int, int]]) -> list[tuple[int
 
 
 def _room(rows: Rows, rises: Rises) -> Array:
-    """The room's temperature at every row (n,): the first ambient, or what the first readings say."""
+    """The room's temperature at every row (n,): the first ambient, or by the first readings."""
     if rows.rooms:
         return np.concatenate([b.values(rows.rooms[0]) for b in rows.batches])
     if rows.blocks:
@@ -224,7 +224,7 @@ def _chain(channel: str, rows: Rows, rises: Rises, body_degC: Array) -> tuple[in
 
 
 def _left(rows: Array, aim: Array) -> float:
-    """What a regression leaves, by norm."""
+    """Norm of the residual of a regression."""
     return float(np.linalg.norm(aim - rows @ np.linalg.lstsq(rows, aim, rcond=None)[0])) if len(aim) else 0.0
 
 

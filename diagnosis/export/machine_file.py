@@ -47,7 +47,7 @@ def diagnosed_text(
         intervals: of those values; every value needs one.
         added: mechanisms by name, or any part by its path ("bodies.bed", "sensors.front": refinements), new or changed.
         notes: comments by name or path of what was added or changed: where it comes from.
-        origin: what stands under `calibrated`.
+        origin: the entry `calibrated`.
 
     Raises:
         InputError: no value of that name, or one that the file does not hold as its own.
@@ -142,7 +142,7 @@ def _with_parts(old: TwinPart, parts: Mapping[str, BaseModel]) -> TwinPart:
 def _filled(
     parts: Mapping[str, BaseModel], updates: Mapping[str, Update]
 ) -> tuple[dict[str, BaseModel], dict[str, Update]]:
-    """The added mechanisms with their fitted values, and the values that stand elsewhere."""
+    """The added mechanisms with their fitted values, and the values elsewhere."""
     filled, rest = dict(parts), {}
     for path, update in updates.items():
         group, name, *below = path.split(".")
@@ -173,7 +173,7 @@ def _put_part(document: YamlText, path: str, given: BaseModel, old: TwinPart) ->
 
 
 def _put_default(document: YamlText, path: str, network: Network, own: Mapping[str, str]) -> None:
-    """A mechanism's value that stood nowhere but in its class is written out, so that it can be changed."""
+    """A mechanism's default value is written out, so that it can be changed."""
     steps = ["twin", *path.split(".")]
     if steps[1] != "mechanisms" or len(steps) != 4 or _held_steps(document, path) != steps[:3]:
         return
@@ -192,7 +192,7 @@ def _check(
     text: str, before: Machine, part: TwinPart, network: Network, updates: Mapping[str, Update],
     own: Mapping[str, str], where: str,
 ) -> None:  # fmt: skip
-    """Raises WorkError where the text does not say what it was meant to."""
+    """Raises WorkError where the text differs from what was to be written."""
     try:
         machine = parse_machine(text, where)
         again, read = compile_network(machine, where), twin_part(machine, where)
@@ -217,7 +217,7 @@ def _check(
 
 
 def _frame(held: Any) -> Any:
-    """A part of a twin without its values, nor those of a mechanism that may stand in the file or in its class."""
+    """A part of a twin without its values, nor those of a mechanism that may be in the file or in its class."""
     if isinstance(held, Value):
         return Value
     if isinstance(held, BaseModel):

@@ -303,9 +303,9 @@ def caps(n: int) -> tuple[str, ...]:
 
 
 def slow_residual_ratio(rms: Sequence[Rms], fitted: Fitted) -> float:
-    """Left-out errors of unfiltered rows, less noise, over what a network of castings usually leaves; the median.
+    """Left-out errors of unfiltered rows, less noise, over the usual residual of a network of castings; the median.
 
-    Both are shares of what the channel moves. Channels that noise alone moves do not count.
+    Both are shares of the channel's movement. Channels that move by noise only do not count.
     """
     moves = moved_rms(fitted)
     beyond = [
@@ -331,7 +331,7 @@ def moved_rms(fitted: Fitted) -> dict[str, float]:
 def verdict_of(
     effects: Sequence[Effect], more: bool, rms: Sequence[Rms], slow: float, runs: int, policy: Policy = POLICY
 ) -> Verdict:
-    """The verdict on all effects of listed mechanisms: they explain the difference where they leave noise alone.
+    """The verdict on all effects of listed mechanisms: they explain the difference where the residual is noise.
 
     Args:
         more: whether the residual follows something that no listed mechanism does.

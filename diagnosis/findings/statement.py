@@ -283,7 +283,7 @@ def _size(effect: Effect) -> str:
 
 
 def _few(phrases: list[str]) -> list[str]:
-    """What a sentence names of several parameters; all stand in `findings.json`."""
+    """What a sentence names of several parameters; `findings.json` has all of them."""
     more = len(phrases) - _MAX_NAMED
     return phrases if more < 1 else [*phrases[:_MAX_NAMED], f"{more} more"]
 

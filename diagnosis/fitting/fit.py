@@ -49,7 +49,7 @@ class Fitted(Point):
 
     @cached_property
     def own(self) -> list[Array]:
-        """Each batch's unknowns by least squares under the covariance's blocks: a start is no structure."""
+        """Nuisances (q_b,) of each batch by least squares under the covariance's blocks: a start is no structure."""
         white, blocks = self.marginal.covariance.white, self.problem.linearise(self.x, self.nuisance)
         starts = len(self.problem.nuisances.start_K)  # an effect may add a body to those of the marginal
         every = enumerate(zip(blocks, self.nuisance, strict=True))
@@ -60,7 +60,7 @@ class Fitted(Point):
 
     @cached_property
     def noise(self) -> Noise:
-        """What each channel leaves, and how many rows count as one."""
+        """Residual noise of each channel, and how many rows count as one."""
         left = self.problem.residuals(self.x, self.own)
         return estimate(left, [m.channel for m in self.problem.measured], len(self.problem.channels), len(self.z))
 
@@ -74,8 +74,8 @@ class Fitted(Point):
 
 
 def own_step(jacobian: Array, own: Array, left: Array, size: Array | float = 1.0) -> Array:
-    """The step (q,) of a batch's own unknowns from `own` that leaves least of rows `left` (n,), priors of sd `size`
-    counted."""
+    """The least-squares step (q,) of a batch's nuisances from `own` for residuals `left` (n,) and priors of sd
+    `size`."""
     precision = np.broadcast_to(1.0 / np.asarray(size) ** 2, own.shape)
     normal = jacobian.T @ jacobian + np.diag(precision)
     return np.asarray(np.linalg.solve(normal, jacobian.T @ left - precision * own), float)

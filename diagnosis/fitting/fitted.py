@@ -188,8 +188,8 @@ def _under_own(now: Fitted, at: Point, begin: Hyper) -> Fitted:
 
 
 def _learned(begun: Fitted) -> Fitted:
-    """The fit under the covariance that it begins under. A channel in which no draw shows what the fit leaves, as where
-    a nut passes a sensor, has more noise."""
+    """The fit under the covariance that it begins under. A channel whose residual no draw shows, as where a nut passes
+    a sensor, has more noise."""
     fitted, covariance = tuned(_fitted(begun)), begun.marginal.covariance
     for _ in range(POLICY.channel_rounds):
         before = fitted.marginal.covariance.factor
@@ -310,7 +310,7 @@ def relinearised(fitted: Fitted, steps: int = POLICY.fit_steps) -> Fitted:
     (low, high), spread = z_bounds(problem.unknowns), _spread(problem.unknowns)
 
     def rows(z: Array) -> tuple[list[Array], float]:
-        """Whitened rows left over at z, and twice the negative log posterior up to a constant."""
+        """Whitened residuals at z, and twice the negative log posterior up to a constant."""
         with np.errstate(over="ignore", invalid="ignore"):
             left = problem.residuals(x_of(problem.unknowns, z), fitted.nuisance)
             white = marginal.white([r + offset for r, offset in zip(left, marginal.offset, strict=True)])
@@ -338,7 +338,7 @@ def relinearised(fitted: Fitted, steps: int = POLICY.fit_steps) -> Fitted:
             try:
                 left, then = rows(moved)
             except (InputError, WorkError):
-                then = np.inf  # too far a step: no machine has such values
+                then = np.inf  # too long a step: values that no machine has
             if np.isfinite(then) and then < cost:
                 break
             damping = max(POLICY.damping_factor * damping, POLICY.damping_start)
@@ -374,7 +374,7 @@ def deterministic_fit(fitted: Fitted) -> Fitted:
     state = State.at(problem, fitted.z, fitted.own, fitted.noise)
     state = annealed(problem, state, POLICY.deterministic_steps, tolerance)
     if misfits(noise_left(problem, state)):
-        with suppress(WorkError, InputError):  # no machine has such values
+        with suppress(WorkError, InputError):  # values that no machine has
             state = likelier(problem, state, _elsewhere(fitted))
     at = Point(fitted.machine, fitted.part, fitted.batches, problem, state.z, state.nuisance, fitted.lead_rows)
     return calibrated(at, state.noise, fitted.runs)
@@ -418,7 +418,7 @@ def _left_out(one: Fitted) -> LeftOutRows:
 
 
 def rows_as_given(fitted: Fitted) -> LeftOutRows:
-    """Every batch predicted by the machine file's own values; its starts and zeros alone are fitted."""
+    """Every batch predicted by the machine file's own values; only its starts and zeros are fitted."""
     problem = fitted.problem
     z = np.zeros(len(problem.unknowns))
     nuisance = [np.zeros_like(own) for own in fitted.nuisance]
@@ -449,7 +449,7 @@ def harms(before: LeftOutRows, after: LeftOutRows) -> bool:
 
 
 def _rows_left(problem: CalibrationProblem, every_z: Sequence[Array], nuisance: Sequence[Array]) -> LeftOutRows:
-    """What each batch leaves, predicted by parameters and starts of its own."""
+    """Residuals of each batch, predicted by parameters and starts of its own."""
     errors = []
     table = []
     for k, (z, own) in enumerate(zip(every_z, nuisance, strict=True)):

@@ -108,7 +108,7 @@ class Marginal:
         return len(self.own)
 
     def white(self, rows: Sequence[Array]) -> list[Array]:
-        """Rows (n_b, …) of every batch under the blocks alone."""
+        """Rows (n_b, …) of every batch, whitened by the blocks only."""
         return [self.covariance.white(b, r) for b, r in enumerate(rows)]
 
     def grams(self, columns: Sequence[Array]) -> Grams:

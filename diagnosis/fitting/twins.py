@@ -1,4 +1,4 @@
-"""Refined twins: machines that a lumped network may stand for, and what their recordings would differ by.
+"""Refined twins: machines that a lumped network may represent, and how their recordings would differ.
 
 A body of a lumped network has one temperature; a casting has gradients, a sensor sits somewhere in them, heat enters
 somewhere else. What that makes of recordings is no noise: it has a shape, given by this machine, its inputs and its
@@ -99,7 +99,7 @@ def _misfit(
     known = {p.name: v for p, v in zip(network.parameters, drawn, strict=True)}
     own = np.array([known.get(p.name, v) for p, v in zip(fine.network.parameters, fine.network.values, strict=True)])
     n = len(batches)
-    for body in cut:  # what a machine has done before leaves gradients
+    for body in cut:  # the history of a machine causes gradients
         cells = fine.network.bodies[body]
         sd_K = max(POLICY.start_gradient_min_sd_K, POLICY.start_gradient_share * network.start_spread_K)
         across_K = dice.of("start", body).normal(0.0, sd_K, (n, 1))
@@ -140,7 +140,7 @@ def _shown(problem: CalibrationProblem, values: Array, scatter: Mapping[str, Arr
 
 def refined(part: TwinPart, network: Network, values: Array, dice: Dice) -> tuple[TwinPart, list[str]]:
     """A twin part whose lumps are chains of cells with inner resistance, and the bodies that were cut; links, heats and
-    sensors stand anywhere in them. Its parameters keep their names."""
+    sensors are anywhere in them. Its parameters keep their names."""
     total = network.conductance_W_per_K(values)
     joined = {place.partition("@")[0] for link in part.links.values() for place in link.between}
     joined |= {e.of.partition("@")[0] for e in part.exposures.values()}

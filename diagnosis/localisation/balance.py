@@ -2,7 +2,7 @@
 
 Without a heat of its own a part of a thermal network is never warmer than the warmest of its start and of the
 surroundings that it is exposed to so far, nor colder than the coldest: the maximum principle (Protter and Weinberger
-1967, Maximum Principles in Differential Equations, ch. 3). A recording that says otherwise needs a path that the
+1967, Maximum Principles in Differential Equations, ch. 3). A recording that contradicts it needs a path that the
 machine file lacks, and no statistics.
 """
 

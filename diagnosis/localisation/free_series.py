@@ -214,7 +214,7 @@ class Posterior:
 def _log(shared: Array) -> Array:
     """``(bᵀ A⁻¹ b - log det A) / 2`` of an information A with its pull b as last row and column (..., p + 1, p + 1)."""
     shared = shared.copy()
-    shared[..., -1, -1] = UNUSED_CORNER  # whatever stands there, the row before it becomes the half-solved pull
+    shared[..., -1, -1] = UNUSED_CORNER  # whatever its value, the row before it becomes the half-solved pull
     root = np.linalg.cholesky(shared)
     log_root = np.log(np.diagonal(root, 0, -2, -1)[..., :-1]).sum(axis=-1)
     return np.asarray(0.5 * (root[..., -1, :-1] ** 2).sum(axis=-1) - log_root)
@@ -376,7 +376,7 @@ class Point:
         return self.last_step < POLICY.linear_step_converged_sd
 
     def moved(self, held: Sequence[Held]) -> Point:
-        """To the optimum given what is held, with the noise that is left there; with nothing held, the noise alone."""
+        """To the optimum given what is held, with the residual noise there; with nothing held, only the noise."""
         optimum = self.search.optimum(held)
         here = replace(self, search=PlaceSearch(self.search.fitted, self.search.bases, optimum.noise), last_step=0.0)
         if not held:
@@ -388,7 +388,7 @@ class Point:
         nuisance = [v[:q] for v, q in zip(optimum.nuisance, self.problem.nuisance_sizes, strict=True)]
         try:
             return replace(Point.of(self.problem, x, nuisance, self.hats, optimum.noise), last_step=step)
-        except WorkError:  # too far: what was found stands as it is
+        except WorkError:  # too far: what was found is kept
             return here
 
 

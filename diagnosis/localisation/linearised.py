@@ -33,7 +33,7 @@ class Optimum:
 
 @dataclass(frozen=True)
 class FitRows:
-    """Blocks by batch, and where the fit stands: parameters z (p,) and nuisances (q_b,), in prior sd.
+    """Blocks by batch, and the point of the fit: parameters z (p,) and nuisances (q_b,), in prior sd.
 
     Rows and columns of other things are in given noises too; `weight` (channels,) is what a row's square counts.
     """
@@ -63,7 +63,7 @@ class FitRows:
         rows, own, now, _ = self._scaled(b, weight, more)
         rows = np.vstack([*(c * np.sqrt(weight[self.blocks[b].channel]) for c in columns), rows.T])
         seen = rows @ own
-        seen[-1] -= now  # the prior's own rows: nuisances stand at `now`, not at 0
+        seen[-1] -= now  # the prior's own rows: nuisances are at `now`, not at 0
         shadow = solve_triangular(self._root(own), seen.T, trans="T", check_finite=False)
         upper = blas.dsyrk(1.0, rows.T, trans=1)
         upper = blas.dsyrk(-1.0, np.asfortranarray(shadow), beta=1.0, c=upper, trans=1, overwrite_c=1)
@@ -95,7 +95,7 @@ class FitRows:
         return Optimum(np.asarray(dz), nuisance, noise)
 
     def _scaled(self, b: int, weight: Array, more: Sequence[Array]) -> tuple[Array, Array, Array, Array]:
-        """Derivatives and residual (n, p + 1), nuisances (n, q) and where they stand (q,), the rows' scale (n,)."""
+        """Derivatives and residual (n, p + 1), nuisances (n, q) and their values (q,), the rows' scale (n,)."""
         block, now = self.blocks[b], self.nuisance[b]
         scale = np.sqrt(weight[block.channel])
         rows = np.column_stack([block.jacobian * self.spread, block.residual]) * scale[:, None]

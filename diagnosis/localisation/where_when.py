@@ -1,6 +1,6 @@
 """Where and when: which body's heat, which error's displacement or which sensor's reading a calibration cannot explain.
 
-A free smooth series at each place stands for whatever is missing there, with all nuisances integrated out; places and
+A free smooth series at each place represents whatever is missing there, with all nuisances integrated out; places and
 kinds compete by marginal likelihood (MacKay 1992). What is found is held while the next place is sought, so that a
 second effect does not borrow the first one's, and noise is judged by what all of them leave.
 """
@@ -144,7 +144,7 @@ RANKING = ("rank", "kind", "place", "gain", "evidence", "probability", "sigma", 
 
 @dataclass(frozen=True)
 class FoundPlace:
-    """A place that explains what the others leave; `odds` are of nothing and of each kind with the others held.
+    """A place that explains the residual of the others; `odds` are of nothing and of each kind with the others held.
 
     `gain` in nats over leaving it out, `sigma` its amplitude in `unit`; `series` holds mean and sd (B, K) at the hats.
     """

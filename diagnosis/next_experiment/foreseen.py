@@ -29,7 +29,7 @@ EXTRA_SENSOR = "one more sensor at "  # the channel of a sensor that is not ther
 
 @dataclass(frozen=True)
 class Foreseen:
-    """How well R runs separate A alternatives: nats (A, A, R) by which the log likelihood of data of the first falls
+    """How well R runs separate A alternatives: nats (A, A, R) by which the log likelihood of data of the first drops
     when the second explains them, both refitted; `with_sensor` (A, A, R, E) with one more sensor at a body of `places`.
     """
 

@@ -27,8 +27,8 @@ class Run:
     """One run: what the machine does in `stages`, after what it did `before`, which is not recorded.
 
     `label` names it in a sentence: "… would distinguish them". `surroundings` are the recorded channels over time; rows
-    and changes stand on multiples of `row_s`. `clock_h` is the time of day at which it begins, `initial_degC` where a
-    machine without recorded surroundings has stood.
+    and changes are at multiples of `row_s`. `clock_h` is the time of day at which it begins, `initial_degC` where a
+    machine without recorded surroundings has been at rest.
     """
 
     label: str
@@ -73,7 +73,7 @@ class Run:
         return RunPlan(self.label, time_s, drivers, air, dict(start or {}), self.initial_degC, self.row_s)
 
     def text(self, start: Mapping[str, float] | None = None, comments: Sequence[str] = ()) -> str:
-        """The run as a run plan file, which reads back as `plan(machine, start)`; `comments` stand above it."""
+        """The run as a run plan file, which reads back as `plan(machine, start)`; `comments` come first."""
         given: dict[str, object] = {
             "name": self.label,
             "step": f"{self.row_s:g} s",
@@ -91,8 +91,8 @@ class Run:
 def menu(machine: Machine, batches: Sequence[Batch], drivers: Sequence[str], row_s: float = 300.0) -> list[Run]:
     """What a shop can do: each of the `drivers` by itself, cooling down, a night, a heated hall.
 
-    Speeds go up to the highest recorded one, the room begins at its recorded median; `row_s` is how far rows stand
-    apart. None where some driver cannot be 0: it shows what happens and is not set by the shop.
+    Speeds go up to the highest recorded one, the room begins at its recorded median; `row_s` is the spacing of rows.
+    None where some driver cannot be 0: it shows what happens and is not set by the shop.
 
     Raises:
         InputError: no batches.
@@ -118,14 +118,14 @@ def menu(machine: Machine, batches: Sequence[Batch], drivers: Sequence[str], row
 
 @dataclass(frozen=True)
 class _Shop:
-    """What recordings say about what a machine can do."""
+    """What a machine can do, by its recordings."""
 
     machine: Machine
     row_s: float
     pace: float  # of all durations
     highest: Mapping[str, float]  # by driver, the largest value recorded
     switches: frozenset[str]  # drivers that are on or off
-    rest: Mapping[str, float | None]  # where a driver stands while another runs
+    rest: Mapping[str, float | None]  # value of a driver while another runs
     room_degC: Mapping[str, float]  # by recorded surrounding
     initial_degC: float
 

@@ -91,8 +91,8 @@ def less(fitted: Fitted, done: Round, baseline: Fitted) -> Fitted:
 def one_round(
     now: Fitted, workers: Processes, report: Progress, before: Screen | None = None, listed: bool = True
 ) -> Round:
-    """What one effect more would explain, the likeliest first; free forms stand in for what no list names, alone if not
-    `listed`."""
+    """What one effect more would explain, the likeliest first; free forms represent what no list names; they are the
+    only candidates if not `listed`."""
     report("screen", 0, 0)
     forms = _forms(now)
     linear = [c for c, f in forms.values() if f.linear]
@@ -107,8 +107,8 @@ def one_round(
 
 
 def decided(done: Round) -> Round:
-    """A round with what its explanations gain, the likeliest first; what alone makes possible what the recordings show
-    before all.
+    """A round with the gains of its explanations: first those that make possible what the recordings show, then the
+    likeliest.
 
     Structure that is drawn about a fit without an effect may imitate one, or be made of what an effect would explain.
     So the likeliest is confirmed, and the next one if it loses its place by that; after a few, the best of them stays.
