@@ -16,7 +16,7 @@ from data.arrays import Array
 from features.nets import Nets
 
 _DAMPING_START, _DAMPING_MOST = 1e-2, 1e8
-_LEAST_KEPT = 0.25  # of the fall that the quadratic model promises, for a step to be trusted farther
+_LEAST_KEPT = 0.25  # of the decrease that the quadratic model predicts, for less damping
 
 
 def train(
@@ -26,7 +26,7 @@ def train(
 
     Net s minimises `Σ_n (known·(y − ŷ))² / Σ_n known + decay · |w, b, v|²` over its rows: x_t (S, p, n), y and known
     (S, n); known is 0 on padding, else 1, or the square root of a row's weight. Each net has its own damping (÷ 10
-    after a step that brings a quarter of the fall that the quadratic model promises, else × 10; a step that raises the
+    after a step with a quarter of the decrease that the quadratic model predicts, else × 10; a step that raises the
     loss is taken back) and stops by itself, so a net's result does not depend on its neighbours. Float64 in one
     thread, whatever torch is set to: the matrices are small, and callers train in parallel.
 
@@ -93,14 +93,14 @@ def _trained(tensors: list[Tensor], nets: Nets, decay: float, iterations: int) -
         output, hidden_t = outputs(trial, x_t, n_hidden, transfer)
         error_t = (y - output).mul_(known)
         loss_t = error_t.square().sum(dim=1) / count + trial.square() @ penalty
-        fall = loss - loss_t
-        better = (fall > 0) & (failed == 0)
+        decrease = loss - loss_t
+        better = (decrease > 0) & (failed == 0)
         each, row = better[:, None, None], better[:, None]
         theta, error = torch.where(row, trial, theta), torch.where(row, error_t, error)
         hidden, loss = torch.where(each, hidden_t, hidden), torch.where(better, loss_t, loss)
-        kept = better & (fall > _LEAST_KEPT * promised)
+        kept = better & (decrease > _LEAST_KEPT * promised)
         damping = torch.where(kept, 0.1 * damping, 10.0 * damping).clamp_(min=1e-12)
-        done = (kept & (fall < 1e-6 * loss_t)) | (damping > _DAMPING_MOST)
+        done = (kept & (decrease < 1e-6 * loss_t)) | (damping > _DAMPING_MOST)
         if bool(done.any()):
             out[place[done]], steps[place[done]] = theta[done], step
             some = ~done

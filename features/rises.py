@@ -8,7 +8,7 @@ An input is named by its channel and, behind an @, what is made of it; the plain
 | `front@rate` | slope of the rise over the last 10 min (since the first usable sample where that is nearer) | K/h |
 | `front@ambient` | T(t) − T_ambient(t), less its first usable value | K |
 | `front@lag30min` | rise behind a first-order lag of the stated time constant | K |
-| `speed@lag30min` | driver behind such a lag, at rest (0) when the batch starts | the driver's unit |
+| `speed@lag30min` | driver behind the same lag, at rest (0) when the batch starts | the driver's unit |
 | `room@start` | value at the batch's first usable sample, held | degC |
 """
 

@@ -2,7 +2,7 @@
 
 To add one: a class below `Family` in a file of its own and a line in `models/families/__init__.py`. It needs
 `fit_design` and `respond`, or `fit_folds` and `respond_folds` where many folds share work. Predictions are 0 at a
-batch's start whatever `respond` gives there; `started` is the design that such a model is to be fitted on.
+batch's start whatever `respond` gives there; `started` is the design that the model is to be fitted on.
 """
 
 from __future__ import annotations

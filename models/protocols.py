@@ -119,7 +119,7 @@ def placed(batches: Sequence[Batch], order: Literal["name"] | Sequence[str | int
     """The batches with their places in the stated order; by name, numbers in an id count as numbers.
 
     Raises:
-        InputError: a batch is not in the list, or stands there twice.
+        InputError: a batch is not in the list, or is there twice.
     """
     if order is None:
         return list(batches)

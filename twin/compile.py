@@ -80,7 +80,7 @@ _MARK = "own path: "
 def own_paths(machine: Machine, part: TwinPart) -> dict[str, str]:
     """By parameter of the network: ``{"exposures.bed-sink.conductance": "mechanisms.sink.conductance"}``.
 
-    Parameters that stand under their own path are left out. Every value of a structural mechanism is marked, and the
+    Parameters under their own path are left out. Every value of a structural mechanism is marked, and the
     marks are looked for in the compiled network, so that a new mechanism needs nothing here.
 
     Raises:
@@ -130,7 +130,7 @@ def _islands(network: Network) -> Iterator[str]:
     from scipy.sparse.csgraph import connected_components
 
     n = network.n_cells
-    near = np.zeros((n + 1, n + 1))  # the last one stands for all surroundings
+    near = np.zeros((n + 1, n + 1))  # the last one represents all surroundings
     touched = [np.flatnonzero(e.direction) for e in network.edges if e.surrounding is not None]
     for at in touched:
         near[at, n] = 1.0

@@ -19,7 +19,7 @@ Scale = Literal["log", "linear", "logit"]
 
 @lru_cache(maxsize=4096)
 def convert(text: str | float, unit: str) -> float:
-    """The number in `unit` that "14 W/K", "6.6 kJ/K", "20 degC" or a bare number (already in `unit`) stands for.
+    """The number in `unit` that "14 W/K", "6.6 kJ/K", "20 degC" or a bare number (already in `unit`) means.
 
     Raises:
         ValueError: no number, an unknown unit, or one of another dimension; the message says got, expected, example.
@@ -93,7 +93,7 @@ class Value(BaseModel):
 
 @dataclass(frozen=True)
 class Spec:
-    """What a parameter is, wherever it stands: unit, meaning, usual value and prior, bounds, sign.
+    """Definition of a parameter, wherever it is used: unit, meaning, usual value and prior, bounds, sign.
 
     `scale` says in which coordinate it is fitted: log (positive), linear (signed), logit (a share between 0 and 1).
     `spread` is the prior's sd in that coordinate and, like `value`, the default where a machine file gives none. `per`

@@ -162,7 +162,7 @@ class Tilt(Section):
 class ErrorChain(Section):
     """An error channel as a signed chain; the key is the channel. Plus closes the gap, unless `words` state otherwise.
 
-    A closed chain of lengths gives no error when everything warms alike and expands alike; `uniform_length` (m) is
+    A closed chain of lengths gives no error when everything warms and expands equally; `uniform_length` (m) is
     what its signed lengths add up to (0 for a closed one). Chains with gains alone are not checked.
     """
 

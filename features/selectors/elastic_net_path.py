@@ -64,7 +64,7 @@ def active_inputs(products: Array, with_target: Array, levels: Array) -> NDArray
         beta[n[leaves], column[leaves]] = 0.0
         active[n, column] = ~leaves
         barred[:] = False
-        barred[n[leaves], column[leaves]] = True  # it stands at the border now and must not rejoin at once
+        barred[n[leaves], column[leaves]] = True  # it is at the border now and must not rejoin at once
         rest = r - (g @ beta[..., None])[..., 0]
     out[problem] |= (levels <= penalty[:, None])[:, :, None] & active[:, None, :]
     return out

@@ -22,7 +22,7 @@ _CONSTANT = 1e-12  # variance over mean square below which an input counts as co
 class Statistics:
     """Correlations over the stacked usable rows of the training batches.
 
-    between (p, p): of the inputs; with_target (p,); varying (p,): False for an input that stands still,
+    between (p, p): of the inputs; with_target (p,); varying (p,): False for a constant input,
     whose correlations are 0 (1 with itself).
     """
 

@@ -18,7 +18,7 @@ from models.base import Family
 from models.numerics.batches import fold_masks
 from models.program import Builder, Program
 
-_ROUNDING = 1e-6  # of what no model leaves
+_ROUNDING = 1e-6  # of the uncompensated error
 # Places of P0 that are tried, as shares of the travel from its low end; of equal ones the first.
 _BEYOND = (0.0, 1.0, 0.25, 0.5, 0.75, -0.25, -0.5, 1.25, 1.5)
 

@@ -22,7 +22,7 @@ class MeanCurve(Family):
     """The mean over the training batches of the error at the same time since the start.
 
     Beyond the longest batch the last value holds; between recorded times it is interpolated. `fitted`: time_s (t,),
-    error_um (t,). A channel along an axis has such a curve for each position, and between positions it is on a line:
+    error_um (t,). A channel along an axis has one curve for each position, and between positions it is on a line:
     then `fitted` has along (the position channel), position_mm (m,), and curve k is at first[k] : first[k + 1].
     """
 

@@ -168,7 +168,7 @@ def lag_shapes(max_lags: int, degree: int) -> list[Array]:
 
 
 def koyck_shapes(n_decays: int) -> list[Array]:
-    """The input alone, or with one of `n_decays` geometric tails, which stand behind it (Koyck 1954)."""
+    """The input alone, or with one of `n_decays` geometric tails, which follow it (Koyck 1954)."""
     each = np.eye(n_decays + 1)
     return [each[:, :1], *(each[:, [0, j]] for j in range(1, n_decays + 1))]
 

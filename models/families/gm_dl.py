@@ -23,9 +23,9 @@ _NEAREST_K = 0.5  # bands whose mean start temperatures are closer than this are
 class GMDL(Family):
     """Two layers in bands: a free-running GM(1,N), whose output, now and before, a distributed lag weighs.
 
-    Every band of start temperature (ambient at the batch's start) has a sub-model of its own that stands at the mean
+    Every band of start temperature (ambient at the batch's start) has its own sub-model, placed at the mean
     start temperature of its training batches. A batch that starts at T0 between neighbours Ta < T0 < Tb gets the
-    weights (Tb − T0)/(Tb − Ta) and (T0 − Ta)/(Tb − Ta); outside the range the nearest stands alone. `bands` is their
+    weights (Tb − T0)/(Tb − Ta) and (T0 − Ta)/(Tb − Ta); outside the range only the nearest counts. `bands` is their
     number, with equally many batches, or the temperatures between them, °C. A band of fewer than `least_batches`
     training batches joins a neighbour; `fitted` has the resulting bands. There is one band where start
     temperatures are not known.

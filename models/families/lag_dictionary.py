@@ -3,8 +3,8 @@
 | columns | what | per 1 of |
 |---|---|---|
 | `front after 30 min` | the rise behind a first-order lag of that time constant | K |
-| `spindle^2 after 30 min` | a driver, or the square of a speed, behind such a lag; at rest before | full scale |
-| `front at start, gone in 2 h` | how far a sensor stood from the others at the start, times 1 − exp(−t/τ) | K |
+| `spindle^2 after 30 min` | a driver, or the square of a speed, behind the same lag; at rest before | full scale |
+| `front at start, gone in 2 h` | difference of a sensor from the others at the start, times 1 − exp(−t/τ) | K |
 | `start level, gone in 2 h` | median start temperature above 20 °C (ISO 1), times 1 − exp(−t/τ) | K |
 | `clock, gone in 2 h` | 1 − exp(−t/τ): common to all starts | 1 |
 
@@ -47,8 +47,8 @@ _KELVIN = ("K", "degC")
 
 _LEVELS = (0.1, 10.0, 1000.0)  # prior variance of a gain per K, in units of what no column explains
 _STEADY = (1.0, 100.0)  # offset and noise of that, against its walk in an hour
-_SHARPNESS = 10.0  # a setting that leaves a tenth more counts e^-1 as much
-_ODD = 6.0  # a batch is mistrusted that leaves so many times what the median of the others leaves without its pull
+_SHARPNESS = 10.0  # a setting with a tenth more residual counts e^-1 as much
+_ODD = 6.0  # a batch is mistrusted whose residual is so many times the median of the others without its pull
 _ONE_ODD_IN = 4  # batches at most, so that the others are a majority
 _FEWEST_BATCHES = 3
 _FEWEST_WINDOWS = 4
@@ -219,14 +219,14 @@ class LagDictionary(Family):
     """error_um = x(t) · β over a dictionary of delayed inputs, drivers and start states, β by pooling batches.
 
     Columns: each input as it is and behind lags of 10 min to 8 h, each driver (a speed also squared) likewise, how the
-    machine stood at the start, and the clock. A batch's error is x · β and a drift of its own that no column explains,
+    machine was at the start, and the clock. A batch's error is x · β and a drift of its own that no column explains,
     so that the fit is generalised least squares with a ridge prior (`models.numerics.batch_process`). The prediction is
     0 at the first row.
 
     Eighteen settings (three levels of the prior; inputs of now, or also slow ones and the start, or also drivers; a
-    drift that wanders or mostly stands) are averaged with weights S^−10, S the mean residual standard deviation of
+    drift that wanders or is mostly constant) are averaged with weights S^−10, S the mean residual standard deviation of
     the training batches left out one by one (in the manner of pseudo-Bayesian model averaging, Geisser and Eddy
-    1979): no single number decides where many settings serve alike. A batch that leaves six times the median of the
+    1979): no single number decides where many settings serve equally. A batch that leaves six times the median of the
     others is mistrusted, at most one in four: its drift variance is a hundredfold and it has no vote. Fewer than 3
     batches take the usual setting.
 
@@ -342,7 +342,7 @@ class _Pooling:
         if len(rest) < _FEWEST_BATCHES:
             usual = self._process(_USUAL_SETTING, prior, ())
             left_um = self.windows.y_um - self.windows.x @ usual.gains()
-            # No other batch to try: the mean square that the fit leaves on its own windows, and as much an hour.
+            # No other batch to try: the mean square residual on its own windows, and as much an hour.
             spread_um2, coef_um = np.full(2, np.mean(left_um**2)), usual.gains(self._place(without))
             weights = np.array([float(s == _USUAL_SETTING) for s in _SETTINGS])
             return {"coef_um": coef_um, "spread_um2": spread_um2, "mistrusted": (), "setting_weights": weights}
@@ -359,7 +359,7 @@ class _Pooling:
         return {"coef_um": coef_um, "spread_um2": spread_um2, "mistrusted": mistrusted, "setting_weights": weights}
 
     def _mistrusted(self, prior: Array, rest: NDArray[np.int64], without: int | None) -> tuple[int, ...]:
-        """Batches that stand out one after the other, each against the others as they are without its pull."""
+        """Outlying batches, one after the other, each against the others as they are without its pull."""
         odd: list[int] = []
         while len(odd) < len(rest) // _ONE_ODD_IN:
             S_um = self._S_um_with(prior, odd, without)

@@ -52,7 +52,7 @@ def left_out_spread(task: Task, square: Array, path: CoefPath, chosen: NDArray[n
     Every batch of a set is predicted by the set's own setting `chosen` (F,) of `path`, learned without that batch.
     a > 0 and b ≥ 0 are least squares of the squared residuals, then made larger until nine tenths of them lie inside
     the 90 % interval and their mean square is as stated. A batch that goes astray does so in proportion to its rises
-    (random slopes: Laird and Ware 1982); a stands for noise and for the zero of a batch, which has noise too.
+    (random slopes: Laird and Ware 1982); a represents noise and for the zero of a batch, which has noise too.
 
     Args:
         square: what the variance grows with, on every row of the design, (n,).

@@ -75,7 +75,7 @@ class LSSVM(KernelExpansion):
 
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """Folds that leave out at most half of the batches share one inverse per (γ, σ); the others are stacked where
-        alike in size.
+        of equal size.
 
         Raises:
             InputError: fewer than 2 usable rows in a fold.

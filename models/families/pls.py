@@ -55,7 +55,7 @@ def krylov_path(xx: Array, xy: Array, n_components: int) -> Array:
         size = np.linalg.norm(gradient, axis=1)
         live &= size > enough
         w = gradient / np.where(live, size, 1.0)[:, None]
-        for _ in range(2 if a else 0):  # twice: rounding leaves a rest of earlier components
+        for _ in range(2 if a else 0):  # twice: rounding leaves residuals of earlier components
             w = w - np.einsum("as,asj->sj", np.einsum("asj,sj->as", u[:a], w) / variance[:a], r[:a])
         image = np.einsum("sij,sj->si", xx, w)
         square = np.einsum("sj,sj->s", w, image)

@@ -17,7 +17,7 @@ from models.numerics.kernels import KernelExpansion, Rows, evenly, kernel, unit_
 
 _LEAST_ROWS_PER_BATCH = 3
 _GROUPS = 3  # that the training batches are left out in, when the setting is chosen
-_STEPS_CHOICE, _STEPS_FIT = 2_000, 2_000_000  # of libsvm: a setting that needs more is judged as it stands then
+_STEPS_CHOICE, _STEPS_FIT = 2_000, 2_000_000  # of libsvm: a setting that needs more is judged unconverged
 
 
 class SVR(KernelExpansion):
@@ -26,8 +26,8 @@ class SVR(KernelExpansion):
     u are the p inputs over a fixed scale per unit, as in lssvm; the error is standardised by the training rows. Outside
     the trained seasons the kernel dies out and the model falls back to its bias. Batches are decimated evenly, to at
     most `max_rows` together. σ from `sigmas`, C from `costs` over the number of rows, and then ε (in standard
-    deviations of the error) from `epsilons`, whose first stands until then: least mean RMS over left-out groups of
-    whole training batches (every third; contiguous quarters of one or two batches), on half the rows. `fitted` has
+    deviations of the error) from `epsilons`, the first of which is used until then: least mean RMS over left-out groups
+    of whole training batches (every third; contiguous quarters of one or two batches), on half the rows. `fitted` has
     rows, setting and score, and the support rows: a trained model predicts without scikit-learn.
 
     Source: V. Vapnik, The nature of statistical learning theory (1995), ch. 6; C.-C. Chang and C.-J. Lin, LIBSVM: a
@@ -59,7 +59,7 @@ class SVR(KernelExpansion):
 
     def fit_design(self, design: Design, train: Sequence[int]) -> Self:
         """Raises InputError: fewer than 2 usable rows."""
-        design = self.started(design)  # the weights sum to 0, so that k may stand for the kernel from the start
+        design = self.started(design)  # the weights sum to 0, so that k may replace the kernel from the start
         rows = self._kept(design, train, self.max_rows)
         if len(rows) < 2:
             raise too_few_rows(self.key, design, train, len(rows), 2)

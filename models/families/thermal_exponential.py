@@ -19,7 +19,7 @@ EXPONENTS = (1.0, 0.5, 0.75, 1.25, 1.5, 1.75, 2.0)  # 1 first: it is kept where 
 _TAU_GRID_S = np.geomspace(120.0, 43200.0, 25)
 _LEAST_RATIO = 2.0  # of two time constants: closer ones give huge amplitudes of opposite sign
 _MOST_STEPS = 12
-_EXACT = 1e-9  # share of the sum of squares below which one lag leaves rounding only
+_EXACT = 1e-9  # share of the sum of squares below which the residual of one lag is rounding
 _WORTH = 0.01  # a second lag must lower the sum of squares by this share
 
 

@@ -48,11 +48,11 @@ _LOOSENESS = 0.5  # prior standard deviation of a pole's log τ about the shared
 class TransferFunction(Family):
     """`y = Σ_i [ k_i u_i + Σ_l K_il / (τ_il s + 1) u_i ]`, at most two poles per input, from rest, running free.
 
-    Two poles stand as the sum of their partial fractions, which contains the cascade K / ((τ1 s + 1)(τ2 s + 1)):
+    Two poles are stated as the sum of their partial fractions, which contains the cascade K / ((τ1 s + 1)(τ2 s + 1)):
     K τ1 / (τ1 − τ2) and K τ2 / (τ2 − τ1). Inputs are the chosen sensors; their direct term is near a lead. With
-    `gaps` also how far each of them stands off the room at the start, as a step: castings that are not in steady state
-    overnight relax like that; it takes two training batches per sensor. With `drivers` also (|n| / 1000 rpm)^m, m 1,
-    1.5 or 2, other drivers and the ambient rise.
+    `gaps` also the difference of each of them from the room at the start, as a step: castings that are not in steady
+    state overnight relax like that; it takes two training batches per sensor. With `drivers` also (|n| / 1000 rpm)^m, m
+    1, 1.5 or 2, other drivers and the ambient rise.
 
     In every fold leave-batch-out over its training batches chooses on a grid from 2 min to 12 h the poles that all
     inputs start from, whether gaps and drivers take part, and the ridge on the gains. Then each input's poles move by

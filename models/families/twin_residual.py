@@ -23,7 +23,7 @@ _MARK = "residual."  # of the regression's learned numbers among the twin's
 
 
 class CorrectedTwin(Twin):
-    """A twin and a regression, named by `residual`, of what it leaves in batches that it did not learn from."""
+    """A twin and a regression, named by `residual`, of its residual in batches that it did not learn from."""
 
     residual: str
     residuals: ClassVar[tuple[str, ...]]  # that may be named
@@ -48,7 +48,7 @@ class CorrectedTwin(Twin):
 
 
 def left_um(recorded_um: Array, predicted_um: Array) -> Array:
-    """What a prediction (n,) leaves, both counted from the first recorded value."""
+    """Residual (n,) of a prediction, both counted from the first recorded value."""
     return recorded_um - (predicted_um - predicted_um[first_place(recorded_um)])
 
 

@@ -32,7 +32,8 @@ class Pool:
     loss: Array
 
     def correlation(self) -> tuple[Array, Array]:
-        """xx of the inputs over their own spread (S, p, p), and that spread (S, p); a flat input stands alone."""
+        """xx of the inputs over their own spread (S, p, p), and that spread (S, p); a constant input is
+        uncorrelated."""
         spread = np.sqrt(np.einsum("sjj->sj", self.xx))
         flat = spread == 0
         spread = np.where(flat, 1.0, spread)

@@ -118,7 +118,7 @@ def _trailing_mean(design: Design, values: Array, window: int) -> Array:
 
 _LEAST_SPREAD = 0.1  # inputs that hardly move (K, or the driver's unit) are not blown up to unit size
 FEWEST_BATCHES = 3  # of fewer, none can be spared for validation
-_LEAST_REST = 1e-3  # of the target's size: below, the linear part leaves rounding only
+_LEAST_REST = 1e-3  # of the target's size: below, the residual of the linear part is rounding
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class Stack:
     """Rows of S nets: x (R, S, p, T, B), rest and known (R, S, T, B), n_batches (S,).
 
     R phases, T steps and B batches, filled up with batches of which nothing is known. x is the input over its rms
-    `spread` (S, p), `rest` what the linear part leaves over its rms `sigma_um` (S,), both over the known rows.
+    `spread` (S, p), `rest` the residual of the linear part over its rms `sigma_um` (S,), both over the known rows.
     """
 
     x: Array

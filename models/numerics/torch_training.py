@@ -78,7 +78,7 @@ class Rows:
 
 
 def losses(net: Trainable, rows: Rows, phase: int, weights: Weights) -> Tensor:
-    """Mean square (S,) that the best readout leaves of a phase, with its penalty, as a function of the weights."""
+    """Mean square residual (S,) of the best readout of a phase, with its penalty, as a function of the weights."""
     states = net.states(torch, weights, rows.x[phase])
     sums = rows.sums(phase, states.detach())  # at the best readout the partial slope is the whole one
     v = rows.readout(sums, net.readout_decay)

@@ -281,7 +281,7 @@ def _cost(z: Array, nuisance: list[Array], residuals: list[Array], blocks: list[
 
 
 def _without_each(problem: CalibrationProblem, point: _Point, noise: Noise) -> list[Array]:
-    """Where the fit would stand without each batch, in turn: the linearised cost less the batch's own part."""
+    """The point of the fit without each batch, in turn: the linearised cost less the batch's own part."""
     low, high = z_bounds(problem.unknowns)
     arrows: list[Arrow] = [
         assemble([b], [v], point.z, problem.unknowns, noise.weight)

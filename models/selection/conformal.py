@@ -43,7 +43,7 @@ class NextRun(NamedTuple):
 
 
 def expected_next(table: pd.DataFrame) -> NextRun:
-    """What a run of the next season leaves, whatever its inputs: from the left-out runs (R,) of one cell.
+    """The residual of a run of the next season, whatever its inputs: from the left-out runs (R,) of one cell.
 
     The expected S is the mean under the protocol nearest to the next season; the bound uses all of them.
 
@@ -88,7 +88,7 @@ class RunBound:
     def of(cls, table: pd.DataFrame) -> Self:
         """From left-out runs: protocol, fold, batch_id, S_um, and, where known, disagreement_um and distance.
 
-        Forward folds stand in order of time. Protocols without a weight are used only where there is no other.
+        Forward folds are in order of time. Protocols without a weight are used only where there is no other.
         """
         table = table[np.isfinite(table["S_um"].to_numpy(float))]
         weighted = table[table["protocol"].isin(_WEIGHTS)]

@@ -168,7 +168,7 @@ class Crossing:
         return {key: self.chosen[key] for key in wanted}
 
     def stability(self, protocol: str, selector: str, n_tsp: int) -> float:
-        """How alike the folds' choices are (mean Jaccard similarity); the same for every family."""
+        """Mean Jaccard similarity of the folds' choices; the same for every family."""
         key = (protocol, selector, n_tsp)
         if key not in self.stabilities:
             sets = [self.inputs(selector, f.train, n_tsp) for f in self.folds[protocol]]
@@ -257,7 +257,7 @@ def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine 
             try:
                 training_statistics(design, fold.train, "none")
             except InputError as error:
-                # A single batch can have too few complete rows to learn from; the other folds still stand.
+                # A single batch can have too few complete rows to learn from; the other folds are still valid.
                 group.remove(fold)
                 lost.append((target, f"{protocol} without fold {fold.name}: {error}"))
     return Crossing(kept[0].machine, tuple(kept), design, plan, folds, (*excluded, *lost, *plan.left_out))

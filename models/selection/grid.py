@@ -137,7 +137,7 @@ def assemble(crossing: Crossing, result: FamilyResult, race: pd.DataFrame, stack
 
 
 def _with_points(crossing: Crossing, cells: pd.DataFrame) -> pd.DataFrame:
-    """The cells with the points that they choose from all runs, and how alike the folds' choices are."""
+    """The cells with the points that they choose from all runs, and the similarity of the folds' choices."""
     own = list(cells[CELL_KEYS].itertuples(index=False))
     chosen = [crossing.inputs(selector, crossing.everything, n) for _, selector, _, n in own]
     return cells.assign(

@@ -106,7 +106,7 @@ def test_it_is_said_that_values_are_relative(drafted: Drafted) -> None:
         "the machine file has no twin part: 2 bodies drafted from 6 batches, named after"
     )
     assert drafted.remarks[1] == (
-        "temperatures determine ratios alone: heat_of_rpm is held at 300 W at 5000 rpm, "
+        "temperatures determine only ratios: heat_of_rpm is held at 300 W at 5000 rpm, "
         "and every other W, W/K and J/K is relative to that"
     )
     assert "all other W, W/K and J/K are relative to it" in drafted.part.mechanisms["heat_of_rpm"].words

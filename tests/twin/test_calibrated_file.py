@@ -116,7 +116,9 @@ def test_a_failure_while_writing_leaves_what_stood_there(source: Path, monkeypat
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "replace", full)
-    with pytest.raises(WorkError, match=r"two.yml: cannot be written .*No space left.*; what stood there is unchanged"):
+    with pytest.raises(
+        WorkError, match=r"two.yml: cannot be written .*No space left.*; the previous content is unchanged"
+    ):
         write_file(source, new_text(), source, overwrite=True)
     assert source.read_text(encoding="utf-8") == TEXT
     assert [p.name for p in source.parent.iterdir()] == ["two.yml"]
@@ -137,7 +139,7 @@ def test_what_cannot_be_written_is_told_before_the_work(source: Path) -> None:
         "head-room", "a-room"
     )
     source.write_text(hidden, encoding="utf-8")
-    with pytest.raises(InputError, match=r"twin.exposures.head-room.conductance does not stand in the file as a value"):
+    with pytest.raises(InputError, match=r"twin.exposures.head-room.conductance is no value with a spread"):
         check_writable(source, network_of())
 
 
@@ -189,5 +191,5 @@ def test_where_it_came_from_is_written_once() -> None:
 
 def test_a_parameter_that_is_not_in_the_file_is_told(sample: Network) -> None:
     p = sample.parameters[0]
-    with pytest.raises(InputError, match=r"m.yml: twin.links.x.conductance does not stand in the file"):
+    with pytest.raises(InputError, match=r"m.yml: twin.links.x.conductance is no value with a spread"):
         with_values(SAMPLE, {"links.x.conductance": Update(p, 1.0, (0.5, 2.0))}, "m.yml")

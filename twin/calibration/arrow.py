@@ -30,9 +30,9 @@ class Corner:
     target: Array  # (q,)
 
     def step(self, dz: Array, share: float = 1.0) -> Array:
-        """The nuisances' step (q,): all that a parameter step dz (p,) asks of them, and `share` of their own.
+        """The nuisances' step (q,): all that a parameter step dz (p,) requires, and `share` of their own.
 
-        Held back from what dz asks, dz would not lead downhill: it is the step of the cost at their optimum.
+        Without the step that dz requires, dz would not lead downhill: it is the step of the cost at their optimum.
         """
         return _solve(self.corner, share * self.target - self.coupling @ dz)
 
@@ -83,7 +83,7 @@ class Arrow:
         return np.clip(bounded.x, low, high)
 
     def gain(self, dz: Array, share: float = 1.0) -> float:
-        """By how much the linearised cost falls with dz (p,) and `share` of the nuisances' own step."""
+        """Decrease of the linearised cost with dz (p,) and `share` of the nuisances' own step."""
         before = self.target @ self.target
         rest = self.target - self.root @ dz
         after = rest @ rest
@@ -145,7 +145,8 @@ def assemble(
 
 
 def _without_nuisances(gram: Array, q: int) -> tuple[Corner, Array] | None:
-    """The corner of a Gram matrix (q + p + 1 square) and what it leaves (p, p + 1); None where rounding forbids it."""
+    """The corner of a Gram matrix (q + p + 1 square) and its Schur complement (p, p + 1); None where rounding forbids
+    it."""
     if gram.diagonal()[:-1].max(initial=0.0) >= GRAM_LIMIT:
         return None
     corner, failed = lapack.dpotrf(gram[:q, :q], lower=0, clean=1) if q else (np.zeros((0, 0)), 0)

@@ -45,9 +45,7 @@ def put_values(document: YamlText, updates: Mapping[str, Update], where: str) ->
     for path, update in updates.items():
         steps, missing = held_steps(document, path)
         if missing and not (missing == ["conductance"] and document.get([*steps, "value"]) is not None):
-            raise InputError(
-                f"{where}: twin.{path} does not stand in the file as a value with a spread; write it there"
-            )
+            raise InputError(f"{where}: twin.{path} is no value with a spread in the file; write it there")
         p = update.parameter
         value, prior = (v if p.unit == "1" else f"{v:g} {p.unit}" for v in map(kept, (update.value, p.prior_value)))
         new = {"value": value, "prior": prior, "interval90": [kept(v) for v in update.interval90]}
@@ -72,7 +70,7 @@ def with_calibrated(text: str, origin: Calibrated) -> str:
 def held_steps(document: YamlText, path: str) -> tuple[list[str], list[str]]:
     """The keys that lead to a parameter's path ("errors.z.chain[0].length") as far as the text holds it, and the rest.
 
-    Parameters of a mechanism stand a level deeper than their path says, a lone conductance a level higher.
+    Parameters of a mechanism are a level deeper than their path says, a lone conductance a level higher.
     """
     out, left = ["twin"], path.replace("[", ".").replace("]", "").split(".")
     while left:
@@ -145,7 +143,7 @@ def _own_paths(text: str, where: str) -> dict[str, str]:
 
 
 def write_file(path: Path, text: str, source: Path, overwrite: bool = False) -> None:
-    """Put the text at `path` in one step; on any failure what stood there stays as it was.
+    """Put the text at `path` in one step; on any failure the previous content stays.
 
     Raises:
         InputError: `path` is the machine file that was calibrated, or exists, and `overwrite` is not set.
@@ -155,7 +153,7 @@ def write_file(path: Path, text: str, source: Path, overwrite: bool = False) -> 
     try:
         write_atomic(path, text)
     except OSError as error:
-        raise WorkError(f"{path}: cannot be written ({error}); what stood there is unchanged") from None
+        raise WorkError(f"{path}: cannot be written ({error}); the previous content is unchanged") from None
 
 
 def check_target(path: Path, source: Path, overwrite: bool = False) -> None:

@@ -163,7 +163,7 @@ RMS_COLUMNS = ("batch", "channel", "unit", "rows", "before", "after", "fitted")
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibrated network and how far it can be trusted; p free parameters.
+    """A calibrated network and its uncertainty; p free parameters.
 
     `network` has the new values, each with its old centre as prior. `rms` has a row per batch and channel, columns
     `RMS_COLUMNS`, in the channel's unit: free-running from first readings with the machine file's values (`before`)

@@ -110,7 +110,8 @@ def descend(problem: Problem, state: State, max_iterations: int, tolerance: floa
 
 
 def _try(problem: Problem, state: State, dz: Array, share: float) -> tuple[State | None, float]:
-    """The state after a step and its gain ratio (real fall over expected), or None where the step must be rejected."""
+    """The state after a step and its gain ratio (actual over expected decrease), or None where the step must be
+    rejected."""
     z = state.z + dz
     nuisance = [v + c.step(dz, share) for v, c in zip(state.nuisance, state.arrow.corners, strict=True)]
     cost = float(z @ z) + sum(float(v @ v) for v in nuisance)
@@ -198,7 +199,7 @@ def likelier(problem: Problem, one: State, other: State) -> State:
 
 
 def log_posterior(problem: Problem, state: State, noise: Noise, inflation: Array) -> float:
-    """Nats, up to a constant, under the noise that a state leaves; so many rows (c,) of a channel count as one."""
+    """Nats, up to a constant, under the residual noise of a state; so many rows (c,) of a channel count as one."""
     rows = np.bincount(np.concatenate(state.channels), minlength=len(problem.channels)) / inflation
     priors = float(state.z @ state.z) + sum(float(v @ v) for v in state.nuisance)
     return -0.5 * (priors + float(np.sum(rows * np.log(noise.factor**2))))
@@ -312,7 +313,7 @@ def _first(problem: Problem, noise: Noise | None, options: FitOptions, progress:
     down = annealed(problem, state, max_iterations, tolerance, progress)
     if len(down.history) >= max_iterations or not misfits(noise_left(problem, down)):
         return down
-    # From above, a misfit can pass for noise and hold the fit where it stands: once more, every row counting in full.
+    # From above, a misfit can pass for noise and stop the fit there: once more, every row counting in full.
     full = annealed(problem, down, len(down.history) + max_iterations, tolerance, progress, correlated=False)
     full = annealed(problem, full, len(full.history) + max_iterations, tolerance, progress)
     return likelier(problem, down, full)
@@ -390,8 +391,8 @@ def result(problem: Problem, state: State, tolerance: float, notes: str) -> Fit:
             f"{_percent(state.expected / state.cost)}; the derivatives do not fit the model or it is not smooth"
         )
     else:
-        fall = state.expected / state.cost  # costs of the history may stand under other noise
-        message = f"stopped after {steps} steps, cost still falling by {_percent(fall)} a step"
+        decrease = state.expected / state.cost  # costs of the history may be under other noise
+        message = f"stopped after {steps} steps, cost still falling by {_percent(decrease)} a step"
     x = x_of(unknowns, state.z)
     low, high = z_bounds(unknowns)
     touching = (state.z <= low + 1e-9) | (state.z >= high - 1e-9)

@@ -31,7 +31,7 @@ class Measured:
     """One batch's usable values, channel by channel in time order; n values of C channels.
 
     `row` (n,) of the recording, `channel` (n,) and `value` (n,): K for sensors in degC, and for errors what is shown
-    less the channel's first usable sample, which stands at row `first` (C,) and is no value of its own.
+    less the channel's first usable sample, at row `first` (C,), which is no value of its own.
     """
 
     batch_id: str
@@ -260,7 +260,7 @@ class CalibrationProblem:
     def linearise(self, x: Array, nuisance: Sequence[Array]) -> Iterator[Block]:
         """One block per batch; batches are linearised together as far as `MOST_NUMBERS` allows.
 
-        The last point's blocks are kept, since a new noise asks for them again, where they are small.
+        The last point's blocks are kept, since a new noise needs them again, where they are small.
         """
         key = _key(x, nuisance)
         if key not in self._last:
@@ -315,7 +315,7 @@ class CalibrationProblem:
         return [tuple(w.name for w in laws if k in w.parameters.values()) for k in self.nuisances.parameters]
 
     def own_deviations(self, nuisance: Sequence[Array]) -> Array:
-        """By how much each batch's own parameters (B, varying) stand off, in fitting coordinates."""
+        """Offsets of each batch's own parameters (B, varying), in fitting coordinates."""
         first = self.nuisances.shared - len(self.nuisances.parameters)
         return np.array([v[first : self.nuisances.shared] for v in nuisance]) * self.nuisances.deviation
 

@@ -25,7 +25,7 @@ def converge_with_lead(
 ) -> tuple[float, CalibrationProblem, State, str]:
     """`converge` for the problem whose drivers lead by as many rows as is likeliest, or as the machine file states.
 
-    Compared are the posteriors at each optimum with the noise of every channel unknown; rows count alike.
+    Compared are the posteriors at each optimum with the noise of every channel unknown; rows count the same for all.
 
     Args:
         problem_at: the problem whose drivers' changes come so many rows (0 to 1) before the row that shows them.

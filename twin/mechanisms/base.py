@@ -28,7 +28,7 @@ Target = Literal["node", "link", "exposure", "heat", "sensor", "error", "surroun
 
 # Where a diagnosis places a port: at the target, at each surrounding, at each body linked with the target (of an error,
 # with the previous port), at any other body, at a body without a link to the target (each pair once), at a surrounding
-# or such a body, or where the multiplied heat goes.
+# or a body, or where the multiplied heat goes.
 PortRole = Literal["itself", "surrounding", "neighbour", "body", "unlinked", "facing", "outlet"]
 SURROUNDING_PORTS = ("air", "surrounding", "room", "supply")  # by these names a port is a surrounding
 

@@ -129,7 +129,7 @@ class VoltageLossHeat(Mechanism):
 class ChargeStrain(Mechanism):
     """Electrodes that swell and shrink with the charge, and a body whose growth per kelvin changes with it.
 
-    In runs at constant currents a rise in temperature and the current itself go together: the second table may stand
+    In runs at constant currents a rise in temperature and the current itself go together: the second table may be
     for either.
     """
 

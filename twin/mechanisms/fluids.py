@@ -60,7 +60,9 @@ class JacketChiller(Mechanism):
         before, now, held = jacket[..., :-1], jacket[..., 1:], {k: v[..., 1:] for k, v in q.items()}
         turned = on[..., 1:].astype(int) - on[..., :-1]  # 1: came on within the interval before, -1: went off
         moved = now - before
-        crossed = (turned != 0) & (moved != 0)  # a set point that follows the room may pass a jacket that stands still
+        crossed = (turned != 0) & (
+            moved != 0
+        )  # a set point that follows the room may pass a jacket at constant temperature
         crossing = np.where(crossed, held["set_point"] + turned * held["hysteresis"], now)
         since = (now - crossing) / np.where(crossed, moved, 1.0)  # share of that interval
         # flow is linear in temperature: its mean since the crossing is the flow at the mean temperature

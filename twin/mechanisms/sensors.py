@@ -18,7 +18,7 @@ from twin.schema import MechanismPart, TwinPart, several
 class SensorLag(Mechanism):
     """A sensor of one time constant, exact for what moves linearly between samples; steady at the first one.
 
-    `view.step_s` is the spacing of the samples; where it is nan they stand at `view.time_s`, evenly or not.
+    `view.step_s` is the spacing of the samples; where it is nan they are at `view.time_s`, evenly or not.
     """
 
     key = "sensor_lag"

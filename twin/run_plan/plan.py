@@ -140,7 +140,7 @@ class RunPlan:
     """A plan on its time grid: the multiples of the step, the borders at which a driver changes, and the end.
 
     `time_s` (n + 1,) rises from 0, not always evenly. `drivers` (n,) hold within each interval; every driver of the
-    machine is there. `surroundings` (n + 1,), degC, stand at the borders and are linear between. `start` has the
+    machine is there. `surroundings` (n + 1,), degC, are values at the borders, linear between. `start` has the
     bodies that the plan names, degC; every other body starts at `initial_degC`.
     """
 

@@ -35,7 +35,7 @@ class PlanTable:
 def read_plan_table(
     path: Path, machine: Machine, units: Mapping[str, str], where: str, others: bool = False
 ) -> PlanTable:
-    """Read a table; `units` maps every driver and surrounding that may stand in it to the unit that is kept.
+    """Read a table; `units` maps every driver and surrounding that it may hold to the unit that is kept.
 
     A header may name the unit of its column, "spindle_rpm [krpm]". Time is the machine file's time column, time_s,
     time_min, time_h, or "time [unit]". A recording serves as it is: the machine's other channels are passed over,
@@ -195,7 +195,7 @@ _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*
 
 
 def quantity(given: Any, unit: str, where: str) -> float:
-    """The number in `unit` that "4 krpm" or a bare number (already in `unit`) stands for.
+    """The number in `unit` that "4 krpm" or a bare number (already in `unit`) means.
 
     Raises:
         InputError: no finite number, an unknown unit or one of another quantity; `where` opens the line.
@@ -240,7 +240,7 @@ def in_range(values: Array, name: str, machine: Machine, where: str) -> Array:
 
 
 def _split(given: Any, unit: str, where: str) -> tuple[float, str]:
-    """Number and unit as written; the unit is empty where none stands."""
+    """Number and unit as written; the unit is empty where there is none."""
     if isinstance(given, int | float) and not isinstance(given, bool):
         value, written = float(given), ""
     else:

@@ -26,8 +26,8 @@ class Balance:
     """``C dT/dt = -K T + q`` of P parameter sets on B batches; what depends on temperature is not in q.
 
     capacity (P, N), conductance (P, R, N, N) and into (P, R, S, N), the heat per kelvin of each surrounding. Regimes
-    also distinguish the drivers of heats, so that held_W (P, R, N) holds within one; `alike` (R,) has one number for
-    all of the same conductances, from 0. Driven heats that follow the clock or take too many values are `timed`.
+    also distinguish the drivers of heats, so that held_W (P, R, N) holds within one; `mode_group` (R,) has one number
+    for all of the same conductances, from 0. Driven heats that follow the clock or take too many values are `timed`.
     """
 
     network: Network
@@ -39,7 +39,7 @@ class Balance:
     into_W_per_K: Array
     air: Air
     held_W: Array
-    alike: NDArray[np.int64]
+    mode_group: NDArray[np.int64]
     timed: tuple[Heat, ...]
 
     @cached_property
@@ -103,7 +103,7 @@ def balance_of(network: Network, values: Array, inputs: Inputs) -> Balance:
         InputError: parameter values of another length, or that are not finite.
     """
     check_values(network, values)
-    regimes, held_W, alike, timed = _finer(network, values, inputs, regimes_of(network, values, inputs))
+    regimes, held_W, mode_group, timed = _finer(network, values, inputs, regimes_of(network, values, inputs))
     spread = np.repeat(values[:, None], regimes.count, axis=1)
     return Balance(
         network,
@@ -115,7 +115,7 @@ def balance_of(network: Network, values: Array, inputs: Inputs) -> Balance:
         network.surrounding_W_per_K(spread, regimes.factor),
         air_of(network, values, inputs),
         held_W,
-        alike,
+        mode_group,
         timed,
     )
 
@@ -132,13 +132,13 @@ def _finer(
     short = len(first) > regimes.count and inputs.valid.sum() < LASTING * len(first)
     if len(first) > MOST or short:
         held, number, first = [], *distinct(inputs, (), regimes.of)
-    alike = regimes.of.ravel()[first]
+    mode_group = regimes.of.ravel()[first]
     watts = np.zeros((len(values), len(first), network.n_cells))
     for heat in held:
         at = heat_W(heat, lambda law, effect: at_tuples(law, effect, values, inputs, first))
         watts += at[..., None] * heat.direction(values)[:, None]
     timed = tuple(h for h in driven if all(h is not other for other in held))
-    return replace(regimes, of=number, factor=regimes.factor[:, alike]), watts, alike, timed
+    return replace(regimes, of=number, factor=regimes.factor[:, mode_group]), watts, mode_group, timed
 
 
 def check_values(network: Network, values: Array) -> None:

@@ -139,7 +139,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class _Rises(Mapping[str, Numeric]):
-    """Temperatures less their first value, worked out for laws that ask."""
+    """Temperatures less their first value, computed for laws that need them."""
 
     degC: Mapping[str, Numeric]
 

@@ -81,8 +81,8 @@ class Coupled:
 
 def plain_modes(balance: Balance) -> Modes:
     """The network's own modes; regimes of the same conductances share them."""
-    first = np.unique(balance.alike, return_index=True)[1]
-    return modes_of(balance.capacity_J_per_K, balance.conductance_W_per_K[:, first]).of_regimes(balance.alike)
+    first = np.unique(balance.mode_group, return_index=True)[1]
+    return modes_of(balance.capacity_J_per_K, balance.conductance_W_per_K[:, first]).of_regimes(balance.mode_group)
 
 
 def solve(balance: Balance, sources: Sequence[Source], rows: Array, start_degC: Array, tolerance_K: float) -> Coupled:
@@ -221,23 +221,23 @@ class _Solver:
         return Chord(slope, modes_of(balance.capacity_J_per_K, balance.conductance_W_per_K + own))
 
     def _mean_slope(self, source: Source, part: slice) -> Array:
-        """By how much a source's heat falls per kelvin along its own direction, mean per regime, (P, R)."""
+        """Decrease of a source's heat per kelvin along its own direction, mean per regime, (P, R)."""
         balance = self.balance
         direction = source.direction
         size = (direction**2).sum(axis=-1)
         sample = slice(part.start, part.stop, max((part.stop - part.start) // SAMPLED, 1))
         slopes = source.slopes(self.borders, sample)
         of, valid = balance.regimes.of[:, sample], balance.inputs.valid[:, sample]
-        fall = np.zeros((len(direction), *valid.shape))
+        decrease = np.zeros((len(direction), *valid.shape))
         for place, slope in slopes.items():
             along = (direction @ self.rows[place]) / np.where(size > 0, size, 1.0)
-            fall = fall - along[:, None, None] * slope.mean(axis=-2)
-        fall = np.where(np.isfinite(fall), np.maximum(fall, 0.0), 0.0)
+            decrease = decrease - along[:, None, None] * slope.mean(axis=-2)
+        decrease = np.where(np.isfinite(decrease), np.maximum(decrease, 0.0), 0.0)
         out = np.zeros((len(direction), balance.regimes.count))
-        overall = (fall * valid).sum(axis=(1, 2)) / max(int(valid.sum()), 1)
+        overall = (decrease * valid).sum(axis=(1, 2)) / max(int(valid.sum()), 1)
         for r in range(balance.regimes.count):
             here = (of == r) & valid
-            out[:, r] = (fall * here).sum(axis=(1, 2)) / here.sum() if here.any() else overall
+            out[:, r] = (decrease * here).sum(axis=(1, 2)) / here.sum() if here.any() else overall
         return out
 
     def _gain(self, slope: Array, part: slice) -> Array:

@@ -44,7 +44,7 @@ def solved_balance(
 ) -> Solved:
     """Solve P sets, values (P, n), from start temperatures (P or 1, B, N) to which the laws of the start are added.
 
-    The states of a linear network stand at every `every`-th border, of another at all of them.
+    The states of a linear network are given at every `every`-th border, of another at all of them.
     """
     balance, places = balance_of(network, values, inputs), Places()
     sources, disabled = sources_of(balance, places)

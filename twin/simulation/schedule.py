@@ -43,7 +43,7 @@ class Chain:
     """How pieces follow one another in their batches.
 
     `by_rank` (ranks, B) is each batch's piece of a rank, `n_pieces` where it has no more; `slot` (pieces,) where a
-    piece stands in it, flattened. `changes[k]` are the batches that enter a new regime before rank k, with the number
+    piece is in it, flattened. `changes[k]` are the batches that enter a new regime before rank k, with the number
     of the (old, new) pair in `pairs` (…, 2); `first_regime` (B,) is the one they start in.
     """
 
@@ -294,7 +294,7 @@ class Drive:
         return self._sorted[every]
 
     def first_bad(self) -> str | None:
-        """Where the first value stands that is not finite within the valid intervals, for messages."""
+        """Where the first value is that is not finite within the valid intervals, for messages."""
         valid = np.arange(self.schedule.n_intervals) < self.schedule.n_rows[:, None]
         bad = np.argwhere(~np.isfinite(self.series) & valid[:, :, None])
         if not len(bad):
@@ -349,7 +349,7 @@ _DIGITS = 9  # relative resolution of driver values
 class Regimes:
     """`of` (B, M) numbers each interval's regime; `factor` (P, R, n_factors) are the factor laws' values there.
 
-    Factors whose drivers take too many values, or that follow the clock, are `varying`: one constant stands for them
+    Factors whose drivers take too many values, or that follow the clock, are `varying`: one constant replaces them
     (half way between their extremes) and the rest of them is heat that depends on temperature.
     """
 

@@ -1,4 +1,4 @@
-"""Where the bodies of a network stand in a picture: strong links short, few crossings, always the same.
+"""Where the bodies of a network are in a picture: strong links short, few crossings, always the same.
 
 Distances are the shortest ways along the links (Kamada and Kawai 1989, Information Processing Letters 31, 7). The flat
 picture is turned step by step, and every body takes the nearest place on a brick pattern; the turn with the shortest
@@ -35,7 +35,7 @@ def places(
     Args:
         bodies: their names, in the order of the file.
         links: conductance between two bodies, W/K.
-        heavy: what weighs how much: the picture is turned so that the heavy stands low.
+        heavy: what weighs how much: the picture is turned so that the heavy is low.
     """
     if not bodies:
         return {}
