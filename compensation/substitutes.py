@@ -284,7 +284,7 @@ class Watch:
         same: value that the channel has kept, `same_s` how long, s, and `moved_K` what the regression predicts for
             that time, K.
         time_s: time stamp of the last sample, s; None before the first.
-        levels: whether levels are compared; not where the operator has said that they are right.
+        levels: whether levels are compared; not where the operator has stated that they are right.
     """
 
     status: tuple[Status, ...]

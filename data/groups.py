@@ -58,7 +58,7 @@ class Joint:
 class Group:
     """Tables with the same columns: files, or sheets of workbooks. `notes`: what the user must check.
 
-    `key` is the name in the machine file; `joint` tells how the group belongs to the recordings.
+    `key` is the name in the machine file; `joint` states how the group belongs to the recordings.
     """
 
     tables: list[tuple[Path, Table]]

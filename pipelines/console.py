@@ -73,7 +73,7 @@ class Pace:
         self._of, self._marks = 0, [(0, now_s)]  # (finished, when)
 
     def left(self, n: int, of: int, now_s: float) -> str:
-        """Note that `n` of `of` are finished; "about 3 min left", or empty where nothing can be said yet."""
+        """Note that `n` of `of` are finished; "about 3 min left", or empty where nothing is known yet."""
         last, when_s = self._marks[-1]
         if of != self._of or n < last:  # another step
             self._of, self._marks = of, [(0, when_s)]

@@ -24,8 +24,8 @@ INSTEAD: Mapping[str, str] = {  # regular expression, in lower case -> preferred
     r"robustly|seamless(ly)?|powerful|cutting.edge|state.of.the.art|blazing(ly)?": "the measured property",
     r"previously|used to be": "the present state; history belongs in the changelog",
     r"and so on|etc\.": "the whole list, or what the members share",
-    r"told|beside": "reported, stated; next to",
-    r"tells? .{0,40}\bapart|would tell": "distinguish, separate",
+    r"tells?|told|said": "reports, states, shows; distinguish",
+    r"beside": "next to",
     r"mend(s|ed|ing)?": "correct, repair",
     r"owes?|owed|debts?": "limited by; shortfall",
     r"honest(ly|y)?": "calibrated, out-of-sample, valid",
@@ -37,6 +37,12 @@ INSTEAD: Mapping[str, str] = {  # regular expression, in lower case -> preferred
     r"(is|are|was|were) not so": "is false",
     r"overlook(s|ed)?": "missed, not detected",
     r"in no list|not known to us": "unlisted; unknown",
+    r"asleep|awake|waking|sleeping|ghosts?": "disabled, enabled; null value",
+    r"foretold|foretells?": "predicted; log predictive density",
+    r"unharmed|worsened": "degraded",
+    r"alike": "the same, equal, similar; indistinguishable",
+    r"such a one|of which none": "one, none",
+    r"is not asked": "nuisance",
 }
 WORDS = {re.compile(rf"\b(?:{pattern})(?!\w)", re.IGNORECASE): instead for pattern, instead in INSTEAD.items()}
 PAGES = [*(ROOT / n for n in ("README.md", "CONTRIBUTING.md", "SECURITY.md")), *sorted((ROOT / "docs").rglob("*.md"))]

@@ -127,7 +127,7 @@ def _habit(batch: Batch, f: Finding) -> str:
 
 
 def _unless_common(found: Sequence[Finding], batch: Batch, machine: Machine, common: Common) -> list[Finding]:
-    """The findings of one check, of which those with a common habit, or at the moment of such a one, mask nothing."""
+    """The findings of one check, of which those with a common habit, or at the moment of one of them, mask nothing."""
     habits = [_habit(batch, f) for f in found]
     often = {k: common[f.channel, habits[k]] for k, f in enumerate(found) if (f.channel, habits[k]) in common}
     out = list(found)

@@ -161,7 +161,7 @@ class Check:
     def habit(self, batch: Batch, finding: Finding) -> str:
         """What a finding shows, where its only evidence is that the run is unusual; "" where it is a fault in any case.
 
-        What most runs of a machine show alike is no fault. Evidence from physics, from the instrument or from other
+        What most runs of a machine have in common is no fault. Evidence from physics, from the instrument or from other
         channels does not weaken by repetition: a sensor can be faulty in every run.
         """
         return ""

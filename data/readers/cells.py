@@ -278,7 +278,7 @@ def to_seconds(column: Any, unit: str, pattern: str | None, decimal: str, zone: 
 
 
 def _utc(local_s: Array, zone: str | None) -> Array:
-    """Seconds of a wall clock in a time zone as those of UTC; its order tells which of two equal hours it is."""
+    """Seconds of a wall clock in a time zone as those of UTC; its order shows which of two equal hours it is."""
     if zone is None:
         return local_s
     naive = pd.to_datetime(pd.Series(local_s), unit="s")

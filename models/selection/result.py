@@ -49,7 +49,7 @@ class GridResult:
     - `race`: which cells were dropped in which round and why, see `models.selection.race.rounds`; empty without a race.
       A cell of the last rounds is in `scores` by the leading protocol alone, a finalist by all of them.
     - `stack`: selector, family, n_tsp and inputs of the best cells of up to five families, whose disagreement about a
-      run tells of its error; weight: in the cell stack, whose members they are. Empty for fewer than two.
+      run shows of its error; weight: in the cell stack, whose members they are. Empty for fewer than two.
     """
 
     machine: str

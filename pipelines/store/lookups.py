@@ -1,7 +1,7 @@
 """Models of the registry by name without MLflow, whose import alone takes longer than a prediction.
 
-What the registry said is kept below the home, and holds as long as the files of a SQLite store are the same. Of a store
-on a server, which may change unseen, and of models whose files are elsewhere, nothing is kept.
+The answers of the registry are kept below the home, and holds as long as the files of a SQLite store are the same. Of a
+store on a server, which may change unseen, and of models whose files are elsewhere, nothing is kept.
 """
 
 from __future__ import annotations
