@@ -220,7 +220,7 @@ class Design:
         return self._masks[key]
 
     def stacked(self, train: Sequence[int]) -> tuple[Array, Array, NDArray[np.int64]]:
-        """x, y_um and batch index of the usable rows of the given batches."""
+        """x (n, p), y_um (n,) and batch index (n,) of the n usable rows of the given batches."""
         trained = np.zeros(self.n_batches, bool)
         trained[np.asarray(train, int)] = True
         keep = self.usable & trained[self.group]
@@ -303,7 +303,7 @@ def _same(some: Sequence[Start | None], others: Sequence[Start | None]) -> bool:
 
 
 def even_rows(design: Design, batch: int, most: int) -> NDArray[np.int64]:
-    """Numbers of a batch's usable rows: all, or `most` of them evenly spread."""
+    """Indices (≤ most,) of a batch's usable rows, evenly spread where there are more."""
     usable = np.flatnonzero(design.usable[design.rows(batch)]) + design.offsets[batch]
     if len(usable) > most:
         usable = usable[np.round(np.linspace(0, len(usable) - 1, most)).astype(int)]
@@ -311,5 +311,5 @@ def even_rows(design: Design, batch: int, most: int) -> NDArray[np.int64]:
 
 
 def decimated_rows(design: Design, train: Sequence[int], most: int) -> list[NDArray[np.int64]]:
-    """The same of every training batch, in rising order of the batches."""
+    """`even_rows` of every training batch, in rising order of the batches."""
     return [even_rows(design, k, most) for k in sorted(train)]

@@ -159,7 +159,7 @@ class Family(ABC):
         return self.predict_batches([batch])[0]
 
     def predict_batches(self, batches: Sequence[Batch]) -> list[Array]:
-        """The same of several batches, so many in one design as memory holds."""
+        """Error_um (n_b,) of several batches, as many in one design as memory holds."""
         found: list[Array] = []
         for some in _by_size(batches, _AT_ONCE // max(1, len(self.inputs))):
             design = Design.build(some, self.inputs, None)
@@ -254,8 +254,8 @@ def family_from_plain(plain: Plain) -> Family:
 
 
 def inner_groups(group: NDArray[np.int64], parts: int = 4) -> NDArray[np.int64]:
-    """Groups for choices inside a training set: its batches; for fewer than 3 batches contiguous quarters of each (or
-    so many parts).
+    """Groups (n,) for choices inside a training set with batches `group` (n,): its batches; for fewer than 3 batches
+    `parts` contiguous parts of each.
 
     A single batch has no batch to leave out, yet train-on-one must choose its penalty too.
     """

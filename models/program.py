@@ -274,6 +274,7 @@ class Builder:
         self.nodes[previous] = replace(self.nodes[previous], args=(later,))
 
     def affine(self, x: int, matrix: Array, offset: Array | float = 0.0) -> int:
+        """matrix (m, n) · x (n,) + offset (m,)."""
         matrix = np.atleast_2d(matrix)
         return self.add("affine", [x], len(matrix), matrix=matrix, offset=np.broadcast_to(offset, len(matrix)))
 
@@ -283,6 +284,7 @@ class Builder:
         return self.add("mul", [centred, self.constant(1.0 / np.broadcast_to(scale, self.size(x)))], self.size(x))
 
     def constant(self, value: Array | Sequence[float] | float) -> int:
+        """A node of constant value (n,)."""
         value = np.atleast_1d(value)
         return self.add("constant", [], len(value), value=value)
 
@@ -302,7 +304,7 @@ class Builder:
         return self.lag(self.join(*[x] * len(taus_s)), np.repeat(taus_s, n), begin)
 
     def delay(self, x: int, delay_s: float, begin: Array | float) -> int:
-        """x a delay later."""
+        """x delayed by `delay_s`, linear between rows; before the start `begin` (0 or 1) times its first x."""
         rows = delay_s / self.step_s
         if rows == 0:
             return x

@@ -232,6 +232,7 @@ class Rises:
 
     @cached_property
     def parts(self) -> list[NDArray[np.int64]]:
+        """Numbers (n_b,) of the rows of every part."""
         return [np.flatnonzero(self.part == b) for b in range(int(self.part[-1]) + 1)]
 
     @cached_property

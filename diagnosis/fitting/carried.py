@@ -57,7 +57,7 @@ def _drives(inputs: Inputs, network: Network) -> bool:
 
 
 def carried_nuisances(old: CalibrationProblem, new: CalibrationProblem, nuisance: Sequence[Array]) -> list[Array]:
-    """Each batch's own unknowns in the new network's order; new ones are at their prior mean, 0."""
+    """Nuisances (q_b,) of each batch in the order of the new network; new ones are at their prior mean, 0."""
     names, before = _names(new), {name: k for k, name in enumerate(_names(old))}
     out = []
     for own in nuisance:

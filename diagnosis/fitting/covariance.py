@@ -50,7 +50,7 @@ class Structure:
 
     @property
     def directions(self) -> tuple[Array, ...]:
-        """Draws and imperfections, each of sd 1."""
+        """Draws and imperfections (n_b, T + K) of every batch, each of sd 1."""
         n = np.sqrt(self.drawn[0].shape[1])
         return tuple(np.hstack([d / n, k]) for d, k in zip(self.drawn, self.known, strict=True))
 
@@ -72,7 +72,7 @@ class Covariance:
 
     @classmethod
     def of(cls, problem: CalibrationProblem, block: Callable[[int, int, slice], Array], **given: Any) -> Covariance:
-        """With `block` of a batch, a channel and its rows in the batch."""
+        """`block` gives the covariance (n, n) of the n rows of a batch and channel, from both numbers and the slice."""
         channels = tuple(m.channel for m in problem.measured)
         roots = tuple({c: _inverse_root(block(b, c, at)) for c, at in slices_of(m)} for b, m in enumerate(channels))
         bare = tuple(np.zeros((len(m), 0)) for m in channels)
@@ -119,7 +119,7 @@ def independent(problem: CalibrationProblem, noise: Array) -> Covariance:
 
 
 def rough(problem: CalibrationProblem, directions: Sequence[Array]) -> Covariance:
-    """Unit noise and as much again that an AR(1) remembers, to begin with."""
+    """The initial covariance: unit noise, AR(1) noise, and `directions` (n_b, K) of every batch, in given noises."""
     share, keep = POLICY.rough_memory
 
     def block(b: int, c: int, at: slice) -> Array:

@@ -184,12 +184,12 @@ class Level:
 
     @cached_property
     def factor(self) -> tuple[Array, bool]:
-        """Cholesky of the directions' information and prior in all batches."""
+        """Cholesky factor (K, K) of the directions' information and prior in all batches."""
         return _factor(self._total)
 
     @cached_property
     def folds(self) -> list[tuple[Array, bool]]:
-        """The same without each batch in turn."""
+        """The same (K, K) without each batch in turn."""
         return [_factor(self._total - self._information(b)) for b in range(self.of.batches)]
 
     def products(self, grams: Grams) -> tuple[Array, Array]:

@@ -335,7 +335,7 @@ class PlaceSearch:
         return found
 
     def probabilities(self, held: Sequence[Held] = ()) -> list[Array]:
-        """By basis each place's probability given what is held; with that of nothing they sum to 1.
+        """By basis the probability (places,) of each place given what is held; with that of nothing they sum to 1.
 
         Nothing and each kind are as likely beforehand, and within a kind each place.
         """

@@ -108,7 +108,7 @@ class AlternativeModel:
 
     @property
     def expected(self) -> list[Array]:
-        """`predicted` from its own first readings."""
+        """`predicted` from its own first readings: by run the rows (n,), in given noises."""
         return [block.residual for block in self.blocks]
 
     def predicted(self, first: Mapping[str, Array]) -> list[Array]:

@@ -54,7 +54,10 @@ class KMedoids(Selector):
 
 
 def medoids_of_all(distance: Array, relevance: Array) -> list[Columns]:
-    """Best set of n medoids for n = 0 to p, of all 2^p sets; set k holds input j where bit p − 1 − j of k is 1."""
+    """Best set of n medoids for n = 0 to p, of all 2^p sets, from distances (p, p) and the inputs' relevance (p,).
+
+    Ties go by relevance, then to the largest set number k; set k holds input j where bit p − 1 − j of k is 1.
+    """
     p = len(distance)
     nearest, worth = np.full((1, p), np.inf), np.zeros(1)
     for j in range(p - 1, -1, -1):
@@ -69,7 +72,10 @@ def medoids_of_all(distance: Array, relevance: Array) -> list[Columns]:
 
 
 def partition_around_medoids(distance: Array, relevance: Array, n: int) -> Columns:
-    """PAM: n medoids built greedily, then the best of all swaps again and again until none helps; sorted columns."""
+    """PAM: n medoids built greedily, then the best swap until none helps; sorted columns (n,).
+
+    `distance` (p, p) between inputs, their `relevance` (p,) decides ties.
+    """
     nearest = np.full(len(distance), np.inf)
     medoids = np.empty(0, np.int64)
     for _ in range(n):

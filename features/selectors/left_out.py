@@ -51,7 +51,7 @@ class Blocks:
 
     @classmethod
     def of_moments(cls, m: Moments, blocks: NDArray[np.int64], columns: NDArray[np.int64]) -> Blocks:
-        """Some blocks of a design's moments, in the order given."""
+        """Blocks (b,) of a design's moments, in the order given, of its `columns` (p,)."""
         sum_z = np.column_stack([m.sum_y[blocks], m.sum_x[np.ix_(blocks, columns)]])
         zz = np.empty((len(blocks), len(columns) + 1, len(columns) + 1))
         zz[:, 0, 0] = m.yy[blocks]

@@ -175,7 +175,10 @@ def error_channels(design: Design) -> Array:
 
 
 def held_out(parts: Sequence[Columns], y_um: Array) -> Mask:
-    """Rows of the concatenated parts that validate: whole batches, of fewer than 3 batches whole quarters of them."""
+    """Validation rows (n,) of the concatenated parts: whole batches; of fewer than 3 batches, whole quarters of them.
+
+    `parts` are indices into y_um of the rows of each batch.
+    """
     if sum(len(r) > 0 for r in parts) < 3:
         parts = [quarter for r in parts for quarter in np.array_split(r, 4)]
     energy = [float(np.square(y_um[r] - y_um[r].mean()).sum()) if len(r) else 0.0 for r in parts]

@@ -175,7 +175,8 @@ def start_temperatures_degC(design: Design) -> Array:
 def bands_of(
     start_degC: Array, train: Sequence[int], bands: int | Sequence[float], least_batches: int
 ) -> list[tuple[int, ...]]:
-    """The training batches in bands from cold to warm, by number of bands (equally many batches) or edges in °C.
+    """The training batches in bands from cold to warm, by `start_degC` (n_batches,), by number of bands (equally many
+    batches) or edges in °C.
 
     Bands of too few batches join their colder or warmer neighbour, whichever is smaller. One band where a start
     temperature is not known.

@@ -130,6 +130,7 @@ class Task:
 
     @classmethod
     def of(cls, design: Design, masks: Mask, scaled: bool) -> Self:
+        """The fits of F training sets: `masks` (F, n_batches); `scaled`: inputs in units of their spread."""
         blocks = Blocks.of(design.moments)
         return cls(design, masks, blocks, blocks.pool(masks, scaled), scaled)
 

@@ -40,7 +40,7 @@ class Windows:
 
     @classmethod
     def of(cls, design: Design, x: Array, train: Sequence[int]) -> Windows:
-        """Windows of 10 min, longer where the batches of the design have more than 1200 of them together."""
+        """Means of x (n, p) and errors over windows of 10 min, longer where the design has more than 1200 windows."""
         trained = np.zeros(design.n_batches, bool)
         trained[list(train)] = True
         rows = np.flatnonzero(design.usable & trained[design.group] & np.isfinite(x).all(axis=1))

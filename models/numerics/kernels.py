@@ -77,7 +77,7 @@ def kernel(u: Array, v: Array, sigma: float, linear: bool) -> Array:
 
 
 def products(u: Array, v: Array) -> tuple[Array, Array]:
-    """−|u_i − v_j|²/(2p), never above 0, and u_i·v_j/p: all that a kernel needs besides σ; (..., n, m)."""
+    """−|u_i − v_j|²/(2p), never above 0, and u_i·v_j/p, (..., n, m) each, of u (..., n, p) and v (..., m, p)."""
     p = max(1, u.shape[-1])
     dot = u @ np.swapaxes(v, -1, -2) / p
     half = dot - (u**2).sum(axis=-1)[..., :, None] / (2.0 * p)
@@ -103,7 +103,8 @@ def kernel_from_origin(half: Array, dot: Array, sigma: float, linear: bool) -> A
 
 
 def from_origin(support: Array, alpha: Array) -> tuple[Array, Array]:
-    """Support rows and weights of the plain kernel that answer as those of `kernel_from_origin`, but for the level."""
+    """Support rows (n + 1, p) and weights (n + 1,) for `kernel_of` that predict as those of `kernel_from_origin`, but
+    for the level."""
     return np.vstack([support, np.zeros(support.shape[1])]), np.append(alpha, -alpha.sum())
 
 
@@ -197,6 +198,7 @@ class Bordered:
 
     @classmethod
     def of(cls, kernels: list[Kernel], known: Array, y: Array, gamma: float, bias: bool = True) -> Self:
+        """Solve S systems of n rows: `known` (S, n) is 1 where a row takes part, y (S, n), without `bias` no offset."""
         inverse = _inverses(kernels, gamma)
         if bias:
             u = (inverse @ known[:, :, None])[..., 0]

@@ -142,7 +142,7 @@ class FamilyScores:
             self.column[column.inputs, column.fold] = first + c
 
     def left_out(self, folds: Sequence[Fold], columns: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Predictions of one cell, fold after fold on the rows of the batches that it tests, µm."""
+        """Predictions (n,) of one cell, µm, fold after fold on the rows of the batches that it tests."""
         return np.concatenate([self.kept[int(c)] for _, c in zip(folds, columns, strict=True)]).astype(np.float32)
 
 

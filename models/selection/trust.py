@@ -166,13 +166,14 @@ class Region:
 
 
 def worth(distance: Array | float, tested: float) -> Array:
-    """What a correction is worth so far outside the region, in widths: all of it as far as runs were left out
-    (`RunBound.tested`), from there on less with the distance."""
+    """Share (n,) of a correction that applies at a distance (n,) outside the region, in widths: 1 as far as runs were
+    left out (`RunBound.tested`), from there on less with the distance."""
     return np.asarray(1.0 / (1.0 + np.maximum(distance - np.fmax(tested, SLACK), 0.0)))
 
 
 def watched(batch: Batch, inputs: Sequence[str]) -> dict[str, Array]:
-    """The quantities of a batch that a region knows: inputs, start temperatures of their channels, drivers."""
+    """The quantities (n,) of a batch that a region knows, by name: inputs, start temperatures of their channels,
+    drivers."""
     return {name: feature(batch, name) for name in _watched_names(batch, inputs)}
 
 
@@ -263,7 +264,10 @@ def _rms(values_um: Array) -> float:
 
 
 def farthest(beyond: Mapping[str, Array]) -> tuple[float, str]:
-    """How far a batch went (95 % quantile over the rows), and in which quantity; ("", 0) inside everywhere."""
+    """Distance of a batch in widths (95 % quantile over the rows), and in which quantity; (0, "") inside everywhere.
+
+    `beyond` has the distance (n,) of every row by quantity.
+    """
     if not beyond:
         return 0.0, ""
     far = np.nan_to_num(row_quantiles(np.stack(list(beyond.values())), 0.95), nan=0.0)

@@ -100,9 +100,11 @@ class Problem(Protocol):
     @property
     def nuisance_sizes(self) -> tuple[int, ...]: ...
 
-    def linearise(self, x: Array, nuisance: Sequence[Array]) -> Iterable[Block]: ...
+    def linearise(self, x: Array, nuisance: Sequence[Array]) -> Iterable[Block]:
+        """A block per batch at x (p,) and the batches' nuisances (q_b,)."""
 
-    def residuals(self, x: Array, nuisance: Sequence[Array]) -> Iterable[Array]: ...
+    def residuals(self, x: Array, nuisance: Sequence[Array]) -> Iterable[Array]:
+        """Measured − simulated (n_b,) of every batch in given noises."""
 
 
 @dataclass(frozen=True)

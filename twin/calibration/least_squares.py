@@ -46,7 +46,7 @@ class State:
 
     @classmethod
     def at(cls, problem: Problem, z: Array, nuisance: list[Array], noise: Noise) -> State:
-        """Linearised at z.
+        """Linearised at z (p,) and the batches' nuisances (q_b,).
 
         Raises:
             WorkError: not finite there, or the simulation failed.

@@ -258,7 +258,8 @@ class CalibrationProblem:
         return values
 
     def linearise(self, x: Array, nuisance: Sequence[Array]) -> Iterator[Block]:
-        """One block per batch; batches are linearised together as far as `MOST_NUMBERS` allows.
+        """One block per batch at x (p,) and nuisances (q_b,); batches are linearised together as far as `MOST_NUMBERS`
+        allows.
 
         The last point's blocks are kept, since a new noise needs them again, where they are small.
         """
@@ -334,7 +335,7 @@ class CalibrationProblem:
         return [m.value - m.of(s) for m, s in zip(self.measured, series, strict=True)]
 
     def residual_series(self, x: Array, nuisance: Sequence[Array]) -> dict[str, dict[str, Array]]:
-        """Measured − simulated by batch and channel in the channel's unit, NaN where nothing was measured."""
+        """Measured − simulated (rows,) by batch and channel in the channel's unit, NaN where nothing was measured."""
         out: dict[str, dict[str, Array]] = {}
         for m, residual in zip(self.measured, self.residuals(x, nuisance), strict=True):
             out[m.batch_id] = {}

@@ -30,7 +30,7 @@ def lagged_sums(series: Array) -> tuple[Array, Array]:
 
 
 def correlated_rows(series: Iterable[Array]) -> float:
-    """The integrated autocorrelation time in rows, pooled over series: how many rows count as one independent row.
+    """The integrated autocorrelation time in rows, pooled over series (n,): how many rows count as one independent row.
 
     ``−1 + 2 Σ_m (rho_2m + rho_2m+1)`` while these sums of neighbours stay positive (the initial positive sequence
     of Geyer 1992, "Practical Markov chain Monte Carlo", Statistical Science 7, §3.3), about zero; not below 1.
@@ -40,9 +40,9 @@ def correlated_rows(series: Iterable[Array]) -> float:
         if np.isfinite(one).any():
             by_length.setdefault(len(one), []).append(one)
     pooled = np.zeros(max(by_length, default=0))
-    for n, alike in by_length.items():  # their power adds up: one transform back for all
+    for n, equal in by_length.items():  # their power adds up: one transform back for all
         size = next_fast_len(2 * n, real=True)
-        rows = np.where(np.isfinite(alike), alike, 0.0)
+        rows = np.where(np.isfinite(equal), equal, 0.0)
         pooled[:n] += irfft((np.abs(rfft(rows, size)) ** 2).sum(axis=0), size)[:n]
     if len(pooled) < 2 or pooled[0] <= 0:
         return 1.0

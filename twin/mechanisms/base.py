@@ -112,7 +112,7 @@ class Mechanism(ABC):
         cls.port_roles = {**usual, **cls.port_roles}
 
     def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
-        """Heat into the places of `into`, W. A law with ports is temperature-dependent."""
+        """Heat into the places of `into`, W, in the shape of the view. A law with ports is temperature-dependent."""
         raise NotImplementedError
 
     def factor(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
@@ -120,7 +120,7 @@ class Mechanism(ABC):
         raise NotImplementedError
 
     def displacement(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
-        """Added to an error channel, in the channel's unit."""
+        """Added to an error channel, in the channel's unit, in the shape of the view."""
         raise NotImplementedError
 
     def reading(self, seen: Numeric, view: View, p: Mapping[str, Numeric]) -> Numeric:
@@ -128,7 +128,7 @@ class Mechanism(ABC):
         raise NotImplementedError
 
     def surrounding_K(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
-        """Added to a surrounding's temperature."""
+        """Added to a surrounding's temperature, K, in the shape of the view."""
         raise NotImplementedError
 
     def start_K(self, view: View, p: Mapping[str, Numeric]) -> Numeric:

@@ -180,6 +180,7 @@ class Places:
         self.rows: list[Numeric] = []
 
     def number(self, weights: Numeric) -> int:
+        """The number of a place, by its weights (N,) over the cells."""
         key = weights.tobytes()
         if key not in self._number:
             self._number[key] = len(self.rows)
@@ -225,7 +226,7 @@ class HeatSource:
         return {k: self._evaluate(seen, part, place=k).imag / STEP for k in self.places}
 
     def surrounding_slopes(self, seen: Borders, part: slice) -> dict[int, Numeric]:
-        """The same by the temperature of each surrounding that it depends on."""
+        """Derivative by the temperature of each surrounding, W/K (P, B, 2, m)."""
         laws = (self.heat.law, *self.heat.factors)
         which = dict.fromkeys(p.surrounding for law in laws for p in law.ports.values() if p.cells is None)
         return {s: self._evaluate(seen, part, surrounding=s).imag / STEP for s in which}

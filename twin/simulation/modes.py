@@ -55,7 +55,7 @@ class Modes:
         return Modes(self.rate_per_s[sets], self.shape[sets], self.inverse[sets])
 
     def of_regimes(self, numbers: NDArray[np.int64]) -> Modes:
-        """The modes of some regimes, which may repeat."""
+        """The modes of regimes `numbers` (R,), which may repeat."""
         return Modes(self.rate_per_s[:, numbers], self.shape[:, numbers], self.inverse[:, numbers])
 
 

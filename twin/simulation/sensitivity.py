@@ -211,7 +211,7 @@ def edge_slope(balance: Balance, edge: Edge, j: int) -> Array:
 
 
 def few(pairs: Sequence[tuple[Array, Array]], n_cells: int) -> list[tuple[Array, Array]]:
-    """The same heat in at most as many pairs as there are cells."""
+    """The same heat in at most `n_cells` pairs of directions (R, N) and watts."""
     if len(pairs) <= n_cells:
         return list(pairs)
     n_regimes = len(pairs[0][0])

@@ -90,10 +90,10 @@ def _cost(xy: Array, ends: NDArray[np.int64]) -> float:
 
 
 def crossings(xy: Array, ends: NDArray[np.int64]) -> int:
-    """How many pairs of links without a common body cross."""
+    """Number of crossing pairs of links without a common body; xy (n, 2) of the bodies, `ends` (links, 2)."""
     i, j = np.triu_indices(len(ends), 1)
-    apart = ~(ends[i][:, :, None] == ends[j][:, None, :]).any(axis=(1, 2))
-    one, other = xy[ends[i[apart]]], xy[ends[j[apart]]]  # (pairs, 2 ends, 2)
+    separate = ~(ends[i][:, :, None] == ends[j][:, None, :]).any(axis=(1, 2))
+    one, other = xy[ends[i[separate]]], xy[ends[j[separate]]]  # (pairs, 2 ends, 2)
 
     def sides(line: Array, points: Array) -> Array:
         """On which side of a line both points are, as a product: below 0 if on different ones."""
