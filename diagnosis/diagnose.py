@@ -16,7 +16,7 @@ from data.errors import InputError, WorkError
 from data.machine import Machine
 from data.processes import Processes
 from diagnosis.candidates.free_forms import Form
-from diagnosis.contracts import Where
+from diagnosis.contracts import COLUMNS, Where
 from diagnosis.drafting.draft import drafted_part
 from diagnosis.export.machine_file import changed_parts, with_deviations
 from diagnosis.findings import report_data as made
@@ -28,7 +28,7 @@ from diagnosis.findings.conclude import (
     unlisted_effect,
     verdict_of,
 )
-from diagnosis.findings.report_data import Rms, place_label
+from diagnosis.findings.report_data import place_label
 from diagnosis.findings.schema import (
     DetectionLimit,
     Finding,
@@ -202,7 +202,7 @@ def _diagnosis(
         possible=possible,
         places=[place_label(Where(n.where.kind, n.where.name), part_after) for n in detection_limits],
     )
-    everything = made.empty_tables() | {
+    everything = {name: pd.DataFrame(columns=list(columns)) for name, columns in COLUMNS.items()} | {
         "rms": rms_table,
         "series": made.series_table(before, after, final),
         "acf": made.acf_table(before, after, final),
@@ -220,7 +220,15 @@ def _diagnosis(
             batches=names,
             verdict=verdict,
             findings=findings,
-            fit=_summary(rms, better, len(final.batches)),
+            fit=FitSummary(
+                left_out_rms=LeftOutRms(
+                    before={r.key: r.before for r in rms},
+                    after={r.key: r.after for r in rms},
+                    noise_floor={r.key: r.noise for r in rms},
+                ),
+                batches_improved=better,
+                batches=len(final.batches),
+            ),
             detection_limits=detection_limits,
             next_experiment=_next(run),
             seconds=None,  # set once all is done
@@ -281,25 +289,8 @@ def _detection_limits(table: pd.DataFrame) -> tuple[DetectionLimit, ...]:
             mechanism=mechanism, where=Place(kind=kind, name=name), words=words,
             limit=float(limit) if np.isfinite(limit) else None, unit=unit, absorbed=float(absorbed), absorbed_by=by,
         )
-        for mechanism, kind, name, words, limit, unit, absorbed, by in rows_of(table)
+        for mechanism, kind, name, words, limit, unit, absorbed, by in table.itertuples(index=False, name=None)
     )  # fmt: skip
-
-
-def rows_of(table: pd.DataFrame) -> list[tuple[Any, ...]]:
-    """The table's rows as tuples."""
-    return list(table.itertuples(index=False, name=None))
-
-
-def _summary(rms: Sequence[Rms], better: int, n: int) -> FitSummary:
-    return FitSummary(
-        left_out_rms=LeftOutRms(
-            before={r.key: r.before for r in rms},
-            after={r.key: r.after for r in rms},
-            noise_floor={r.key: r.noise for r in rms},
-        ),
-        batches_improved=better,
-        batches=n,
-    )
 
 
 def _next(run: Proposal | None) -> NextExperiment | None:

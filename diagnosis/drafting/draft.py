@@ -178,11 +178,13 @@ def drafted_part(
             every.append(meshed)
             if not _as_good(chosen.scored, meshed.scored):
                 chosen = meshed
+    fit = chosen.scored
+    left_out = [fit.channels, fit.units, np.nanmean(fit.left_out, axis=0), np.nanmean(fit.zero, axis=0), fit.noise]
     return Drafted(
-        with_values(chosen.part, chosen.scored.network, chosen.scored.values),
+        with_values(chosen.part, fit.network, fit.values),
         (*_words(rows, chosen, heats), *unheard, *rows.remarks),
         _scores(every, chosen),
-        _left_out(chosen.scored),
+        pd.DataFrame(dict(zip(LEFT_OUT_COLUMNS, left_out, strict=True))),
     )
 
 
@@ -260,8 +262,3 @@ def _scores(every: Sequence[_Tried], chosen: _Tried) -> pd.DataFrame:
              t is chosen)
         )  # fmt: skip
     return pd.DataFrame(out, columns=list(SCORE_COLUMNS))
-
-
-def _left_out(found: Scored) -> pd.DataFrame:
-    columns = [found.channels, found.units, np.nanmean(found.left_out, axis=0), np.nanmean(found.zero, axis=0)]
-    return pd.DataFrame(dict(zip(LEFT_OUT_COLUMNS, [*columns, found.noise], strict=True)))

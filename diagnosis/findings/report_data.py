@@ -166,10 +166,6 @@ def _thing(place: str, part: TwinPart) -> str:
 ACF_LAGS = 40
 
 
-def empty_tables() -> dict[str, pd.DataFrame]:
-    return {name: pd.DataFrame(columns=list(columns)) for name, columns in COLUMNS.items()}
-
-
 def rises(worse: Mapping[str, tuple[float, float]], units: Mapping[str, str]) -> str:
     """``the left-out error of T1 from 1.4 to 4.5 K``, of every channel that got worse, the largest ratio first."""
     first = sorted(worse, key=lambda c: worse[c][0] / worse[c][1])

@@ -12,7 +12,7 @@ from data.units import unit_label
 from diagnosis.contracts import CandidateKind, Where
 from diagnosis.findings.report_data import Effect, Other, Rms, beyond_noise, times_noise
 from diagnosis.findings.schema import Alternative, DetectionLimit, Finding, FittedParameter, Place, Verdict, When
-from diagnosis.formatting import Estimate, amount, as_given, few, listed, of_error, percent, with_unit
+from diagnosis.formatting import amount, as_given, few, listed, of_error, percent, with_unit
 from diagnosis.policy import POLICY
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Mechanism
@@ -164,13 +164,7 @@ def verdict_statement(
         separates: the run that would distinguish the explanations `possible`, or show whether they hold.
     """
     # of several effects each says by itself how sure it is, and what may be in its place
-    doubts = [_doubt(f) if len(effects) > 1 else _instead(f) for f in effects]
-    named = listed(
-        [
-            effect_phrase(f) + ("" if f.kind.is_unlisted else _size(f)) + doubt
-            for f, doubt in zip(effects, doubts, strict=True)
-        ]
-    )
+    named = listed([effect_phrase(f) + ("" if f.kind.is_unlisted else _size(f)) + _doubt(f, effects) for f in effects])
     hedge = _hedge(effects[0].probability) if len(effects) == 1 else ""
     reduced = reductions(rms)
     if verdict == "consistent":
@@ -228,7 +222,12 @@ def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Se
 def _sentence(effect: Effect) -> str:
     """The claim where it is a sentence by itself: alternatives, and summaries such as "sensor that drifts"."""
     if effect.kind is CandidateKind.WRONG_PARAMETER:
-        phrases = _few([_replaced(p, effect.was.get(p), effect.parameters[p]) for p in effect.parameters])
+        was = {
+            p: f"{with_unit(as_given(effect.was[p]), e.unit)} → "
+            for p, e in effect.parameters.items()
+            if p in effect.was
+        }
+        phrases = _few([f"{p} ({was.get(p, '')}{amount(e)})" for p, e in effect.parameters.items()])
         several = len(phrases) > 1
         return f"the value{'s' * several} of {listed(phrases)} in the machine file {'are' if several else 'is'} wrong"
     if effect.mechanism not in MECHANISMS or effect.kind.is_unlisted:
@@ -288,10 +287,6 @@ def _few(phrases: list[str]) -> list[str]:
     return phrases if more < 1 else [*phrases[:_MAX_NAMED], f"{more} more"]
 
 
-def _replaced(path: str, was: float | None, now: Estimate) -> str:
-    return f"{path} ({'' if was is None else with_unit(as_given(was), now.unit) + ' → '}{amount(now)})"
-
-
 def _others(effect: Effect) -> list[str]:
     """What would look the same, and the run that would distinguish them; what is less likely is not named."""
     same = [o for o in effect.others if o.indistinguishable and o not in effect.tied][:_MAX_NAMED]
@@ -302,17 +297,15 @@ def _others(effect: Effect) -> list[str]:
     return [f"{_capital(named)} would look the same in these runs{run}."]
 
 
-def _doubt(effect: Effect) -> str:
-    """`` (41 %; or radiation at the bed, 52 %)``: of one effect among several; nothing where it is sure."""
+def _doubt(effect: Effect, among: Sequence[Effect]) -> str:
+    """`` (41 %; or radiation at the bed, 52 %)``: of one effect among several; nothing where it is sure. Of a single
+    effect ``, or radiation at the bed``: what these runs cannot distinguish from it."""
+    if len(among) == 1:
+        return f", or {listed([_other_phrase(o) for o in effect.tied], 'or')}" if effect.tied else ""
     if effect.probability > POLICY.unhedged_probability:
         return ""
     tied = [f"{_other_phrase(o)}, {percent(o.probability)}" for o in effect.tied]
     return f" ({percent(effect.probability)}{''.join(f'; or {text}' for text in tied)})"
-
-
-def _instead(effect: Effect) -> str:
-    """``, or radiation at the bed``: what these runs cannot distinguish from an effect."""
-    return f", or {listed([_other_phrase(o) for o in effect.tied], 'or')}" if effect.tied else ""
 
 
 def _other_phrase(other: Other) -> str:

@@ -25,7 +25,7 @@ from twin.compile import compile_network
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import View
 from twin.network import Heat, Law, Network
-from twin.quantity import Parameter, Value, convert
+from twin.quantity import Value, convert
 from twin.schema import TwinPart, several
 from twin.simulation import Simulation, simulate
 
@@ -61,14 +61,13 @@ def with_disabled(machine: Machine, part: TwinPart, candidates: Sequence[Candida
     network = _disabled(network, names)
     found: dict[str, list[int]] = defaultdict(list)
     parameters = list(network.parameters)
-    by_mark = {(_instance(c), a): [] for c in smooth for a in c.amplitudes}  # type: dict[tuple[str, str], list[str]]
+    by_mark: dict[tuple[str, str], list[Candidate]] = defaultdict(list)
     for c in smooth:
         for a in c.amplitudes:
-            by_mark[_instance(c), a].append(c.name)
-    owner = {c.name: c for c in smooth}
-    doubted = [c for c in candidates if c.change is not None]
-    for c in doubted:
-        assert c.change is not None
+            by_mark[_instance(c), a].append(c)
+    for c in candidates:
+        if c.change is None:
+            continue
         j = network.index(c.change.parameter.name)
         if not parameters[j].free:  # in its own scale: what is doubted is a factor
             parameters[j] = replace(parameters[j], free=True, spread=1.0)
@@ -77,10 +76,11 @@ def with_disabled(machine: Machine, part: TwinPart, candidates: Sequence[Candida
         if not p.source.startswith(AMPLITUDE_OF):
             continue
         instance, _, amplitude = p.source.removeprefix(AMPLITUDE_OF).partition(".")
-        parameters[j] = _free(p)
-        for name in by_mark[instance, amplitude]:
-            if _is_of(owner[name], p):
-                found[name].append(j)
+        # a signed number, so that its derivative is not scaled to 0 at 0
+        parameters[j] = replace(p, free=True, scale="linear", spread=1.0, low=-np.inf, high=np.inf, source="")
+        for c in by_mark[instance, amplitude]:  # in errors that share an instance, each candidate has its own part
+            if not p.name.startswith("errors.") or p.name.startswith(f"errors.{c.where.name}."):
+                found[c.name].append(j)
     return DisabledNetwork(
         replace(network, parameters=tuple(parameters)), {k: tuple(v) for k, v in sorted(found.items())}, left_out
     )
@@ -113,16 +113,6 @@ def _instance(c: Candidate) -> str:
     if c.where.kind == "error" and "expand" in MECHANISMS[c.mechanism].effects():
         return c.name.replace(f"{c.mechanism}_{c.where.name}_", f"{c.mechanism}_", 1)
     return c.name
-
-
-def _is_of(c: Candidate, p: Parameter) -> bool:
-    """Whether a marked parameter is this candidate's: of what an instance writes, the part of its own error."""
-    return not p.name.startswith("errors.") or p.name.startswith(f"errors.{c.where.name}.")
-
-
-def _free(p: Parameter) -> Parameter:
-    """An amplitude as a signed number, so that its derivative is not scaled away where it is 0."""
-    return replace(p, free=True, scale="linear", spread=1.0, low=-np.inf, high=np.inf, source="")
 
 
 def _disabled(network: Network, names: set[str]) -> Network:

@@ -19,7 +19,6 @@ from scipy.sparse.csgraph import connected_components
 from data.arrays import Array
 from diagnosis.fitting.fit import Fitted
 from diagnosis.policy import POLICY
-from twin.network import Reading
 from twin.simulation import Simulation, simulate
 
 
@@ -67,7 +66,8 @@ def impossible(fitted: Fitted) -> tuple[Impossible, ...]:
         bodies = tuple(name for name, own in network.bodies.items() if set(own) <= set(cells.tolist()))
         capacity = float(network.capacity_J_per_K(values)[cells].sum())
         for reading in network.readings:
-            if np.isin(np.flatnonzero(reading.cells), cells).all() and _shows_its_place(reading):
+            of_place = all(law.disabled or law.mechanism.along_time for law in reading.effects)  # and its past
+            if of_place and np.isin(np.flatnonzero(reading.cells), cells).all():
                 for k, to_s, excess_K in _excesses(fitted, run, reach, reading.channel):
                     watts = excess_K * (capacity / to_s + reach.loss_W_per_K / 2.0)
                     one = Impossible(reading.channel, bodies, run.batch_ids[k], to_s, excess_K, watts)
@@ -111,11 +111,6 @@ def _driven(run: Simulation, values: Array, cells: NDArray[np.int64]) -> NDArray
     """Rows (B, K) at which a heat enters or leaves these cells."""
     own = [run.heat_W[h.law.name][0] != 0.0 for h in run.network.heats if h.direction(values)[cells].any()]
     return np.logical_or.reduce(own, axis=0) if own else np.zeros(run.time_s.shape, bool)
-
-
-def _shows_its_place(reading: Reading) -> bool:
-    """Whether a channel shows no more than the temperatures at its place so far: what lags does, too."""
-    return all(law.disabled or law.mechanism.along_time for law in reading.effects)
 
 
 def _excesses(fitted: Fitted, run: Simulation, reach: _Reach, channel: str) -> Iterator[tuple[int, float, float]]:

@@ -34,7 +34,8 @@ def start_of(network: Network, values: Array, inputs: Inputs, steady: bool = Fal
         at_rest[:, k] = np.broadcast_to(factor, (len(values), 1))[:, 0]
     conductance = network.conductance_W_per_K(values, at_rest)[:, None]
     first = _first_air(network, values, inputs)
-    ambient = first[:, :, _ambient(network)] if first.shape[2] else np.full(first.shape[:2], 20.0)
+    recorded = next((s for s, given in enumerate(network.surroundings) if given.channel), 0)
+    ambient = first[:, :, recorded] if first.shape[2] else np.full(first.shape[:2], 20.0)
     heat = np.einsum("psn,pbs->pbn", network.surrounding_W_per_K(values, at_rest), first)
     scale = np.trace(conductance, axis1=-2, axis2=-1)[..., None, None] / network.n_cells
     system = conductance + _LOOSE * scale * np.eye(network.n_cells)
@@ -116,11 +117,6 @@ def _first_air(network: Network, values: Array, inputs: Inputs) -> Array:
     shape = (len(values), inputs.n_batches)
     out = [np.broadcast_to(f, shape) for f in firsts]
     return np.stack(out, axis=-1) if out else np.zeros((*shape, 0))
-
-
-def _ambient(network: Network) -> int:
-    recorded = [s for s, given in enumerate(network.surroundings) if given.channel]
-    return recorded[0] if recorded else 0
 
 
 _STEPS, _CLOSE_K, _SINGULAR, _TINY = 60, 1e-9, 1e-13, 1e-30

@@ -282,14 +282,11 @@ def _words(network: Network, cells: Array, bodies: dict[str, float], weight: dic
     lead = bodies[named[0]] >= 0 if named else True
     one = [b for b in named if (bodies[b] >= 0) == lead]
     other = [b for b in named if (bodies[b] >= 0) != lead]
-    within = [b for b in one if len(network.bodies[b]) > 1 and _changes_sign(cells[network.bodies[b]])]
+    shapes = {b: cells[network.bodies[b]] for b in one if len(network.bodies[b]) > 1}
+    within = [b for b, c in shapes.items() if min(-c.min(), c.max()) > 0.3 * np.abs(c).max()]
     if not other and within:
         return f"{_and(within)} within"
     return f"{_and(one)} against {_and(other) if other else _around(network, cells, one)}"
-
-
-def _changes_sign(cells: Array) -> bool:
-    return bool(cells.min() < -0.3 * np.abs(cells).max() and cells.max() > 0.3 * np.abs(cells).max())
 
 
 def _around(network: Network, cells: Array, named: Sequence[str]) -> str:
