@@ -53,7 +53,7 @@ from diagnosis.fitting.fitted import (
     rows_as_given,
 )
 from diagnosis.localisation.balance import impossible
-from diagnosis.localisation.where_when import Located, locate
+from diagnosis.localisation.where_when import locate
 from diagnosis.next_experiment.proposal import NOTHING, Proposal, deciding_run, revealing_run
 from diagnosis.policy import POLICY
 from diagnosis.result import Diagnosis
@@ -109,10 +109,11 @@ def diagnose(
             # what was missing had passed for drivers that act at another time
             done = search(baseline(machine, part, batches, report, len(recordings), seed, lead_rows), workers, report)
         report("left out", 0, 0)
-        first = _located(done.baseline, done.baseline.batches)
     located: dict[str, pd.DataFrame] = {}
-    if isinstance(first, str):
-        remarks.append(f"no map of where and when: {first}")
+    try:
+        first = locate(done.baseline.problem, done.baseline.x, done.baseline.own, done.baseline.batches)
+    except (InputError, WorkError) as error:
+        remarks.append(f"no map of where and when: {error}")
     else:
         located["map"] = first.map
         if (form := _unlisted_form(done)) is not None:
@@ -120,14 +121,6 @@ def diagnose(
     diagnosis = _diagnosis(part, recordings, batches, done, located, tuple(remarks))
     seconds = round(time.perf_counter() - begun, 1)
     return replace(diagnosis, findings=diagnosis.findings.model_copy(update={"seconds": seconds}))
-
-
-def _located(fitted: Fitted, batches: Sequence[Batch], report: Progress | None = None) -> Located | str:
-    """The map of what a fit cannot explain, or why there is none."""
-    try:
-        return locate(fitted.problem, fitted.x, fitted.own, batches, progress=report)
-    except (InputError, WorkError) as error:
-        return str(error)
 
 
 def _unlisted_form(done: Search) -> Form | None:
