@@ -1,6 +1,6 @@
 """The sample machine: a simulated vertical machining centre as a thermal network of 14 nodes.
 
-Its numbers stand in ``machines/sample_vmc.yml``, typical of the class; none was measured on a machine. Laws and
+Its numbers are in ``machines/sample_vmc.yml``, typical of the class; none was measured on a machine. Laws and
 numerics are this package's own: it shares no code with the twin that is calibrated on its recordings.
 """
 

@@ -1,4 +1,4 @@
-"""What stands above a diagnosis: the panel of an opened demonstration, and what further recordings changed."""
+"""What precedes a diagnosis: the panel of an opened demonstration, and what further recordings changed."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def _with_probability(x: Finding) -> str:
 def shortened(statement: str, most: int = MOST_PARAMETERS) -> str:
     """A statement of findings.json whose lists of values are cut after `most`, with how many more there are.
 
-    Lists are ``dotted.name (old → new), …`` and what stands between brackets with commas; tables have all of them.
+    Lists are ``dotted.name (old → new), …`` and what is between brackets with commas; tables have all of them.
     """
     text = statement
     for begin, end in reversed(_outer_brackets(text)):
@@ -174,7 +174,7 @@ def _outer_brackets(text: str) -> list[tuple[int, int]]:
 
 
 def _split(text: str) -> list[str]:
-    """Parts between commas that stand in no brackets."""
+    """Parts between commas outside brackets."""
     inner = _outer_brackets(text)
     commas = [k for k in range(len(text) - 1) if text[k : k + 2] == ", " and not any(a <= k < b for a, b in inner)]
     ends = [*commas, len(text)]
@@ -201,7 +201,7 @@ def limits_sentence(limits: Sequence[DetectionLimit]) -> str:
     """Which displacement would be claimed on each error channel, in the channel's unit; empty where none is known.
 
     Of the mechanisms that move a channel by themselves, each at the driver or body where least is seen, the one that
-    needs most is named. What acts through a temperature has its limit in another unit and stands in the table.
+    needs most is named. What acts through a temperature has its limit in another unit and is in the table.
     """
     least: dict[str, dict[str, tuple[float, str]]] = {}
     for x in limits:

@@ -101,7 +101,7 @@ def _lines(view: Overview, body: str, tints: _Tints) -> Lines:
 
 
 def _place(view: Overview, m: Mark) -> Tie | str | None:
-    """The link, the body or the error channel that a mark stands at; None where the picture has no such place."""
+    """The link, the body or the error channel that a mark is at; None where the picture has no such place."""
     if m.kind == "link":
         tie = next((t for t in view.ties if t.name == m.name), None)
         return tie if tie is None or not tie.ground else tie.ends[0]

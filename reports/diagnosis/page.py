@@ -198,7 +198,7 @@ def _missing(flux: pd.DataFrame) -> Iterator[Pane]:
 
 
 def _checks(d: Diagnosis) -> tuple[Any, ...]:
-    """All that stands in the fold."""
+    """Everything in the fold."""
     t, f = d.tables, d.findings
     laws: list[Any] = []
     for k, x in enumerate(f.findings, 1):
