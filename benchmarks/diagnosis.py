@@ -102,7 +102,7 @@ def steps_of(p: Posed, repeats: int, which: tuple[str, ...] = STEPS) -> Iterator
         yield "refined twins", timed(lambda: drawn(POLICY.refined_twins, 0), 1)[0]
     yield "refit", statistics.median(timed(partial(refit, fitted, s), 1)[0] for s in chosen(fitted, seen))
     if "locate" in which:
-        yield "locate", timed(lambda: locate(problem, fitted.x, fitted.own, fitted.batches), 1)[0]
+        yield "locate", timed(lambda: locate(problem, fitted.x, fitted.fitted_nuisance, fitted.batches), 1)[0]
 
 
 def chosen(fitted: Fitted, seen: Screen) -> list[Scored]:

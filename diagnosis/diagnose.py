@@ -111,7 +111,7 @@ def diagnose(
         report("left out", 0, 0)
     located: dict[str, pd.DataFrame] = {}
     try:
-        first = locate(done.baseline.problem, done.baseline.x, done.baseline.own, done.baseline.batches)
+        first = locate(done.baseline.problem, done.baseline.x, done.baseline.fitted_nuisance, done.baseline.batches)
     except (InputError, WorkError) as error:
         remarks.append(f"no map of where and when: {error}")
     else:

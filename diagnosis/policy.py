@@ -39,7 +39,7 @@ class Policy:
     initial_rows_per_value: float = convention(20.0, "rows", "so many rows of a smooth misfit count as one")
     first_steps: int = cost(40, "steps", "bounds the descent from the values of the machine file")
     baseline_steps: int = cost(12, "steps", "under each covariance")
-    own_rounds: int = cost(2, "rounds", "of the fit's values and the runs' own unknowns in turn")
+    nuisance_rounds: int = cost(2, "rounds", "of the fit's values and the runs' nuisances in turn")
     deterministic_steps: int = cost(20, "steps", "of a deterministic fit; most end after ten")
 
     # Refined twins and their covariance

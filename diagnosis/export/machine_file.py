@@ -239,9 +239,9 @@ def with_deviations(fitted: Fitted) -> TwinPart:
 
 def deviations(fitted: Fitted) -> dict[str, float]:
     """By parameter that differs from run to run the sd of its logarithm over the batches."""
-    own = fitted.problem.own_deviations(fitted.own)
+    offsets = fitted.problem.nuisance_offsets(fitted.fitted_nuisance)
     names = [fitted.problem.network.parameters[k].name for k in fitted.problem.nuisances.parameters]
-    return dict(zip(names, np.sqrt(np.mean(own**2, axis=0)).tolist(), strict=True))
+    return dict(zip(names, np.sqrt(np.mean(offsets**2, axis=0)).tolist(), strict=True))
 
 
 def changed_parts(before: TwinPart, after: TwinPart) -> Mapping[str, BaseModel]:

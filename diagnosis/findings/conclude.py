@@ -86,8 +86,8 @@ def usual_size(fitted: Fitted, c: Candidate) -> float:
 
 
 def _simulated(fitted: Fitted, values: Array) -> Simulation:
-    problem, nuisance = fitted.problem, fitted.own
-    return simulate(problem.network, values, *problem.own(nuisance), keep_cells=True)
+    problem, nuisance = fitted.problem, fitted.fitted_nuisance
+    return simulate(problem.network, values, *problem.inputs_at(nuisance), keep_cells=True)
 
 
 def _stated(fitted: Fitted, c: Candidate) -> Windows | None:

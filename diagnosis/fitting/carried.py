@@ -1,4 +1,4 @@
-"""The same recordings with another network: unknowns and batches' own unknowns carried over by name."""
+"""The same recordings with another network: unknowns and batches' nuisances carried over by name."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ def carried_nuisances(old: CalibrationProblem, new: CalibrationProblem, nuisance
     """Nuisances (q_b,) of each batch in the order of the new network; new ones are at their prior mean, 0."""
     names, before = _names(new), {name: k for k, name in enumerate(_names(old))}
     out = []
-    for own in nuisance:
-        shared = np.array([own[before[n]] if n in before else 0.0 for n in names])
-        out.append(np.concatenate([shared, own[old.nuisances.shared :]]))
+    for v in nuisance:
+        shared = np.array([v[before[n]] if n in before else 0.0 for n in names])
+        out.append(np.concatenate([shared, v[old.nuisances.shared :]]))
     return out
 
 
@@ -93,7 +93,7 @@ def _beside(network: Network, start: Array, cells: NDArray[np.int64]) -> Array:
 
 
 def carried_start(old: Point, part: TwinPart) -> tuple[CalibrationProblem, Array, list[Array]]:
-    """The problem of a changed twin part, and z (p,) and the batches' own unknowns where a fit from the old one begins;
+    """The problem of a changed twin part, and z (p,) and the batches' nuisances where a fit from the old one begins;
     new parameters start at their value in the part.
 
     Raises:

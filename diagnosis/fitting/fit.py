@@ -19,8 +19,8 @@ class Fitted(Point):
     """A point at its best fit under a covariance, at the hyperparameters `hyper` of that.
 
     `columns` (n_b, p + 1) of every batch are the whitened model, per unit of z, and the target; `runs` that the batches
-    come from, where they are blocks of fewer. `nuisance` is where the batches' own unknowns were linearised, `own` what
-    they are in this fit.
+    come from, where they are blocks of fewer. `nuisance` is where the batches' nuisances were linearised,
+    `fitted_nuisance` what they are in this fit.
     """
 
     marginal: Marginal
@@ -48,34 +48,34 @@ class Fitted(Point):
         return self.level.log_predictive_density(self.grams)
 
     @cached_property
-    def own(self) -> list[Array]:
+    def fitted_nuisance(self) -> list[Array]:
         """Nuisances (q_b,) of each batch by least squares under the covariance's blocks: a start is no structure."""
         white, blocks = self.marginal.covariance.white, self.problem.linearise(self.x, self.nuisance)
         starts = len(self.problem.nuisances.start_K)  # an effect may add a body to those of the marginal
         every = enumerate(zip(blocks, self.nuisance, strict=True))
         return [
-            v + own_step(white(k, b.nuisance), v, white(k, b.residual), self.hyper.own_sizes(len(v), starts))
+            v + nuisance_step(white(k, b.nuisance), v, white(k, b.residual), self.hyper.nuisance_sds(len(v), starts))
             for k, (b, v) in every
         ]
 
     @cached_property
     def noise(self) -> Noise:
         """Residual noise of each channel, and how many rows count as one."""
-        left = self.problem.residuals(self.x, self.own)
+        left = self.problem.residuals(self.x, self.fitted_nuisance)
         return estimate(left, [m.channel for m in self.problem.measured], len(self.problem.channels), len(self.z))
 
     @cached_property
     def state(self) -> State:
         """The fit as a calibration has it; its information is that with structure integrated out."""
-        state = State.at(self.problem, self.z, self.own, self.noise)
+        state = State.at(self.problem, self.z, self.fitted_nuisance, self.noise)
         c = self.level.reduced(self.grams)[:-1, :-1]
         root = np.asarray(np.linalg.cholesky(c + self.level.prior * np.eye(len(c))).T, float)
         return replace(state, arrow=replace(state.arrow, root=root, target=np.zeros(len(c))))
 
 
-def own_step(jacobian: Array, own: Array, left: Array, size: Array | float = 1.0) -> Array:
-    """The least-squares step (q,) of a batch's nuisances from `own` for residuals `left` (n,) and priors of sd
+def nuisance_step(jacobian: Array, nuisance: Array, left: Array, size: Array | float = 1.0) -> Array:
+    """The least-squares step (q,) of a batch's nuisances from `nuisance` for residuals `left` (n,) and priors of sd
     `size`."""
-    precision = np.broadcast_to(1.0 / np.asarray(size) ** 2, own.shape)
+    precision = np.broadcast_to(1.0 / np.asarray(size) ** 2, nuisance.shape)
     normal = jacobian.T @ jacobian + np.diag(precision)
-    return np.asarray(np.linalg.solve(normal, jacobian.T @ left - precision * own), float)
+    return np.asarray(np.linalg.solve(normal, jacobian.T @ left - precision * nuisance), float)

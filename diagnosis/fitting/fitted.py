@@ -27,7 +27,7 @@ from diagnosis.fitting.covariance import (
     rough,
     white_noise,
 )
-from diagnosis.fitting.fit import Fitted, own_step
+from diagnosis.fitting.fit import Fitted, nuisance_step
 from diagnosis.fitting.marginal import Hyper, Marginal
 from diagnosis.fitting.signatures import imperfections, rising_films
 from diagnosis.fitting.twins import drawn_misfits
@@ -113,8 +113,8 @@ def _calibrated_first(
     else:
         problem = problem_at(lead_rows)
         state, _ = converge(problem, options, noise=noise)
-    own = tuple(coarse(batches, every_s, lead_rows))
-    return Point(machine, part, own, problem, state.z, state.nuisance, lead_rows)
+    rows = tuple(coarse(batches, every_s, lead_rows))
+    return Point(machine, part, rows, problem, state.z, state.nuisance, lead_rows)
 
 
 def structured(
@@ -268,11 +268,11 @@ def _columns(marginal: Marginal, blocks: Sequence[Block], at: Point) -> list[Arr
 
 
 def _fitted(begun: Fitted) -> Fitted:
-    """The fit at its optimum under its covariance, the batches' own unknowns linearised where they are in that."""
+    """The fit at its optimum under its covariance, the batches' nuisances linearised where they are in it."""
     covariance, hyper, runs = begun.marginal.covariance, begun.hyper, begun.runs
-    for _ in range(POLICY.own_rounds):
+    for _ in range(POLICY.nuisance_rounds):
         done = relinearised(begun, POLICY.baseline_steps)
-        begun = _begun(replace(done, nuisance=done.own), covariance, hyper, runs)
+        begun = _begun(replace(done, nuisance=done.fitted_nuisance), covariance, hyper, runs)
     return begun
 
 
@@ -322,7 +322,7 @@ def relinearised(fitted: Fitted, steps: int = POLICY.fit_steps) -> Fitted:
     def at(z: Array, left: Sequence[Array]) -> Fitted:
         blocks = problem.linearise(x_of(problem.unknowns, z), fitted.nuisance)
         model = marginal.white([block.jacobian * spread for block in blocks])
-        columns = [np.column_stack([own, r + own @ z]) for own, r in zip(model, left, strict=True)]
+        columns = [np.column_stack([m, r + m @ z]) for m, r in zip(model, left, strict=True)]
         return replace(fitted, z=z, columns=columns)
 
     left, cost = rows(z)
@@ -371,7 +371,7 @@ def deterministic_fit(fitted: Fitted) -> Fitted:
     of the higher posterior is returned, from here and from the deterministic fit of `base`, or the priors' means.
     """
     problem, tolerance = fitted.problem, POLICY.fit_tolerance_nats
-    state = State.at(problem, fitted.z, fitted.own, fitted.noise)
+    state = State.at(problem, fitted.z, fitted.fitted_nuisance, fitted.noise)
     state = annealed(problem, state, POLICY.deterministic_steps, tolerance)
     if misfits(noise_left(problem, state)):
         with suppress(WorkError, InputError):  # values that no machine has
@@ -411,7 +411,7 @@ def _left_out(one: Fitted) -> LeftOutRows:
     every_z = [np.clip(one.level.optimum(one.grams, b), low, high) for b in range(len(blocks))]
     white = one.marginal.covariance.white
     nuisance = [
-        v + own_step(white(k, b.nuisance), v, white(k, b.residual - b.jacobian @ (spread * (z - one.z))))
+        v + nuisance_step(white(k, b.nuisance), v, white(k, b.residual - b.jacobian @ (spread * (z - one.z))))
         for k, (b, v, z) in enumerate(zip(blocks, one.nuisance, every_z, strict=True))
     ]
     return _rows_left(problem, every_z, nuisance)
@@ -421,10 +421,10 @@ def rows_as_given(fitted: Fitted) -> LeftOutRows:
     """Every batch predicted by the machine file's own values; only its starts and zeros are fitted."""
     problem = fitted.problem
     z = np.zeros(len(problem.unknowns))
-    nuisance = [np.zeros_like(own) for own in fitted.nuisance]
+    nuisance = [np.zeros_like(v) for v in fitted.nuisance]
     for _ in range(2):  # starts enter the temperatures linearly, through laws nearly so
         blocks = problem.linearise(x_of(problem.unknowns, z), nuisance)
-        nuisance = [own + own_step(b.nuisance, own, b.residual) for b, own in zip(blocks, nuisance, strict=True)]
+        nuisance = [v + nuisance_step(b.nuisance, v, b.residual) for b, v in zip(blocks, nuisance, strict=True)]
     return _rows_left(problem, [z] * len(nuisance), nuisance)
 
 
@@ -452,8 +452,8 @@ def _rows_left(problem: CalibrationProblem, every_z: Sequence[Array], nuisance: 
     """Residuals of each batch, predicted by parameters and starts of its own."""
     errors = []
     table = []
-    for k, (z, own) in enumerate(zip(every_z, nuisance, strict=True)):
-        residual = problem.only([k]).residuals(x_of(problem.unknowns, z), [own])[0]
+    for k, (z, v) in enumerate(zip(every_z, nuisance, strict=True)):
+        residual = problem.only([k]).residuals(x_of(problem.unknowns, z), [v])[0]
         m = problem.measured[k]
         errors.append(residual * problem.noise[m.channel])
         for c in m.usable.tolist():

@@ -1,4 +1,4 @@
-"""Least squares under the covariance, with directions and the batches' own unknowns integrated out.
+"""Least squares under the covariance, with directions and the batches' nuisances integrated out.
 
 Both act linearly and are linearised once, at the baseline. All that follows (evidence, folds, steps) comes from raw
 Gram matrices of whitened columns. The sizes of what is integrated out are hyperparameters (`Hyper`): another value
@@ -36,8 +36,8 @@ class Hyper:
     starts: float = 1.0
     values: float = 1.0
 
-    def own_sizes(self, count: int, starts: int) -> Array:
-        """Prior sd (count,) of a batch's own unknowns, of which the first are `starts` of bodies."""
+    def nuisance_sds(self, count: int, starts: int) -> Array:
+        """Prior sd (count,) of a batch's nuisances, of which the first are `starts` of bodies."""
         return np.where(np.arange(count) < starts, self.starts, 1.0)
 
     def near(self) -> Iterator[Hyper]:
@@ -53,21 +53,21 @@ class Hyper:
 @dataclass(frozen=True, eq=False)
 class Grams:
     """Per batch products of m whitened columns: with each other (B, m, m), with the K directions (B, K, m) and with the
-    batch's own unknowns, (q_b, m) each."""
+    batch's nuisances, (q_b, m) each."""
 
     inner: Array
     along: Array
-    own: list[Array]
+    nuisance: list[Array]
 
 
 @dataclass(frozen=True, eq=False)
 class Many:
     """Products of C whitened candidate columns: with a model's m columns (m, C) and the directions (K, C), both summed
-    over the batches, with each batch's own unknowns (q_b, C), and of each with itself (C,)."""
+    over the batches, with each batch's nuisances (q_b, C), and of each with itself (C,)."""
 
     mixed: Array
     along: Array
-    own: list[Array]
+    nuisance: list[Array]
     squares: Array
 
 
@@ -85,18 +85,18 @@ class Marginal:
     """Rows of all batches under a covariance.
 
     Args:
-        own: by batch the derivatives (n_b, q_b) by its own unknowns, of prior N(0, 1).
+        nuisance: by batch the derivatives (n_b, q_b) by its nuisances, of prior N(0, 1).
         at: their values (q_b,) where they were linearised.
         starts: how many of them, the first ones, are starts of bodies.
     """
 
-    def __init__(self, covariance: Covariance, own: Sequence[Array], at: Sequence[Array], starts: int) -> None:
+    def __init__(self, covariance: Covariance, nuisance: Sequence[Array], at: Sequence[Array], starts: int) -> None:
         self.covariance, self.starts = covariance, starts
-        self.offset = [n @ v for n, v in zip(own, at, strict=True)]
-        self.own = [covariance.white(b, n) for b, n in enumerate(own)]
+        self.offset = [n @ v for n, v in zip(nuisance, at, strict=True)]
+        self.nuisance = [covariance.white(b, n) for b, n in enumerate(nuisance)]
         self.along = [covariance.white(b, d) for b, d in enumerate(covariance.directions)]
-        self.own_own = [n.T @ n for n in self.own]
-        self.own_along = [n.T @ d for n, d in zip(self.own, self.along, strict=True)]
+        self.nuisance_gram = [n.T @ n for n in self.nuisance]
+        self.nuisance_along = [n.T @ d for n, d in zip(self.nuisance, self.along, strict=True)]
         self.along_along = np.stack([d.T @ d for d in self.along])
         self._levels: dict[Hyper, Level] = {}
 
@@ -105,7 +105,7 @@ class Marginal:
 
     @property
     def batches(self) -> int:
-        return len(self.own)
+        return len(self.nuisance)
 
     def white(self, rows: Sequence[Array]) -> list[Array]:
         """Rows (n_b, …) of every batch, whitened by the blocks only."""
@@ -115,15 +115,15 @@ class Marginal:
         """Of whitened columns (n_b, m) of every batch."""
         inner = np.stack([x.T @ x for x in columns])
         along = np.stack([d.T @ x for d, x in zip(self.along, columns, strict=True)])
-        return Grams(inner, along, [n.T @ x for n, x in zip(self.own, columns, strict=True)])
+        return Grams(inner, along, [n.T @ x for n, x in zip(self.nuisance, columns, strict=True)])
 
     def many(self, columns: Sequence[Array], others: Sequence[Array]) -> Many:
         """Of whitened columns (n_b, m) of a model with many others (n_b, C)."""
         pairs = list(zip(columns, others, strict=True))
         mixed = np.sum([x.T @ y for x, y in pairs], axis=0)
         along = np.sum([d.T @ y for d, y in zip(self.along, others, strict=True)], axis=0)
-        own = [n.T @ y for n, y in zip(self.own, others, strict=True)]
-        return Many(mixed, along, own, np.sum([np.einsum("nc,nc->c", y, y) for y in others], axis=0))
+        nuisance = [n.T @ y for n, y in zip(self.nuisance, others, strict=True)]
+        return Many(mixed, along, nuisance, np.sum([np.einsum("nc,nc->c", y, y) for y in others], axis=0))
 
     def level(self, hyper: Hyper) -> Level:
         """All of it at these hyperparameters; cached, since all hypotheses of a round need the same few."""
@@ -158,23 +158,23 @@ class Level:
         size[: covariance.drawn], size[covariance.drawn :] = hyper.structure, hyper.imperfections
         self.prior = 1.0 / hyper.values**2  # precision of the model's parameters z
         self.size = size
-        self.own_size = [hyper.own_sizes(len(n), of.starts) for n in of.own_own]
+        self.nuisance_sd = [hyper.nuisance_sds(len(n), of.starts) for n in of.nuisance_gram]
         try:
             self._root = [
                 np.linalg.cholesky(n * s * s[:, None] + np.eye(len(n)))
-                for n, s in zip(of.own_own, self.own_size, strict=True)
+                for n, s in zip(of.nuisance_gram, self.nuisance_sd, strict=True)
             ]
         except np.linalg.LinAlgError:
             raise WorkError("the starts of the runs are where the twin cannot be linearised") from None
-        self._taken = [self.beyond(b, d) * size for b, d in enumerate(of.own_along)]
+        self._taken = [self.beyond(b, d) * size for b, d in enumerate(of.nuisance_along)]
         self._volume = np.array([2.0 * float(np.log(np.diag(r)).sum()) for r in self._root]) + covariance.log_det
 
-    def beyond(self, b: int, own: Array) -> Array:
-        """What a batch's own unknowns take of columns, from their products (q_b, m) with these."""
-        return solve_triangular(self._root[b], own * self.own_size[b][:, None], lower=True)
+    def beyond(self, b: int, nuisance: Array) -> Array:
+        """The part (q_b, m) of columns that a batch's nuisances explain, from their products (q_b, m) with these."""
+        return solve_triangular(self._root[b], nuisance * self.nuisance_sd[b][:, None], lower=True)
 
     def _information(self, b: int) -> Array:
-        """Of a batch on the directions, own unknowns taken out, (K, K)."""
+        """Of a batch on the directions, nuisances taken out, (K, K)."""
         size, taken = self.size, self._taken[b]
         return np.asarray(self.of.along_along[b] * size * size[:, None] - taken.T @ taken)
 
@@ -193,10 +193,10 @@ class Level:
         return [_factor(self._total - self._information(b)) for b in range(self.of.batches)]
 
     def products(self, grams: Grams) -> tuple[Array, Array]:
-        """Products (B, m, m) of columns with each other and (B, K, m) with the directions, own unknowns taken out."""
+        """Products (B, m, m) of columns with each other and (B, K, m) with the directions, nuisances taken out."""
         inner, cross = grams.inner.copy(), grams.along * self.size[:, None]
-        for b, own in enumerate(grams.own):
-            taken = self.beyond(b, own)
+        for b, nuisance in enumerate(grams.nuisance):
+            taken = self.beyond(b, nuisance)
             inner[b] -= taken.T @ taken
             cross[b] -= self._taken[b].T @ taken
         return inner, cross
@@ -246,9 +246,9 @@ class Level:
         """Candidate columns as further parameters of a model [model (p), target] at its optimum."""
         inner, cross = (x.sum(axis=0) for x in self.products(grams))
         mixed, along, squares = many.mixed.copy(), many.along * self.size[:, None], many.squares.copy()
-        for b, own in enumerate(many.own):
-            other = self.beyond(b, own)
-            mixed -= self.beyond(b, grams.own[b]).T @ other
+        for b, nuisance in enumerate(many.nuisance):
+            other = self.beyond(b, nuisance)
+            mixed -= self.beyond(b, grams.nuisance[b]).T @ other
             along -= self._taken[b].T @ other
             squares -= np.einsum("qc,qc->c", other, other)
         by_directions = cho_solve(self.factor, np.hstack([along, cross]))
@@ -266,14 +266,15 @@ class Level:
 
     def leftover(self, columns: Sequence[Array], z: Array, grams: Grams) -> list[Array]:
         """Whitened rows (n_b,) left of the target in columns [model (p), target] at z and at the likeliest directions
-        and own unknowns."""
+        and nuisances."""
         of, aim = self.of, np.append(-z, 1.0)
         along = self.size * cho_solve(self.factor, self.products(grams)[1].sum(axis=0) @ aim)
         out = []
         for b, x in enumerate(columns):
             rest = x @ aim - of.along[b] @ along
-            own = solve_triangular(self._root[b], self.beyond(b, (of.own[b].T @ rest)[:, None]), lower=True, trans="T")
-            out.append(rest - of.own[b] @ (self.own_size[b] * own[:, 0]))
+            taken = self.beyond(b, (of.nuisance[b].T @ rest)[:, None])
+            v = solve_triangular(self._root[b], taken, lower=True, trans="T")
+            out.append(rest - of.nuisance[b] @ (self.nuisance_sd[b] * v[:, 0]))
         return out
 
 

@@ -216,7 +216,7 @@ def differences(fitted: Point, proposed: Sequence[Candidate]) -> tuple[dict[str,
     left_out: dict[str, str] = {}
     problem, nuisance = fitted.problem, fitted.nuisance
     before = problem.residuals(fitted.x, nuisance)
-    run = simulate(problem.network, fitted.values, *problem.own(nuisance))
+    run = simulate(problem.network, fitted.values, *problem.inputs_at(nuisance))
     for c in proposed:
         if c.amplitudes or c.part is None:
             continue

@@ -111,7 +111,7 @@ def _misfit(
 
 def _usual_W(problem: CalibrationProblem, values: Array) -> dict[str, float]:
     """The root mean square of every heat while it flows, by its law's name."""
-    inputs, start = problem.own([np.zeros(q) for q in problem.nuisance_sizes])
+    inputs, start = problem.inputs_at([np.zeros(q) for q in problem.nuisance_sizes])
     run = simulate(problem.network, values, inputs, start, keep_cells=True)
     flowing = {name: w[0][run.valid & (np.abs(w[0]) > 0)] for name, w in run.heat_W.items()}
     return {name: float(np.sqrt(np.mean(w**2))) for name, w in flowing.items() if len(w)}
@@ -132,7 +132,7 @@ def _bent(network: Network, usual_W: Mapping[str, float], dice: Dice) -> Network
 
 def _shown(problem: CalibrationProblem, values: Array, scatter: Mapping[str, Array]) -> list[Array]:
     """What every batch shows, (n_b,) in units of the given noise; `scatter` (B,) multiplies heats by law."""
-    inputs, start = problem.own([np.zeros(q) for q in problem.nuisance_sizes])
+    inputs, start = problem.inputs_at([np.zeros(q) for q in problem.nuisance_sizes])
     run = simulate(problem.network, values, inputs.with_own({**inputs.times, **scatter}), start)
     series = np.concatenate([run.readings[0], run.errors[0]], axis=-1)
     return [m.of(s) / problem.noise[m.channel] for m, s in zip(problem.measured, series, strict=True)]

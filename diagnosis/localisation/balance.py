@@ -55,7 +55,7 @@ def impossible(fitted: Fitted) -> tuple[Impossible, ...]:
     problem = fitted.problem
     network, values = problem.network, fitted.values
     first = [np.zeros(q) for q in problem.nuisance_sizes]  # as the first readings: a start may hide what cannot be
-    run = simulate(network, values, *problem.own(first), keep_cells=True)
+    run = simulate(network, values, *problem.inputs_at(first), keep_cells=True)
     seen = np.sum([r.cells for r in network.readings], axis=0) if network.readings else np.zeros(network.n_cells)
     unknown_K = np.where(seen > 0, 0.0, POLICY.unseen_start_sd * network.start_spread_K)
     found: dict[str, Impossible] = {}

@@ -150,7 +150,7 @@ class ForcedNetwork:
             WorkError: the simulation fails there.
         """
         values = problem.values_at(x)[None]
-        solved = solved_balance(problem.network, values, *problem.own(nuisance), TOLERANCE_K)
+        solved = solved_balance(problem.network, values, *problem.inputs_at(nuisance), TOLERANCE_K)
         return cls(problem, solved)
 
     @cached_property

@@ -78,7 +78,7 @@ def plain_rows(done: Round) -> PlainRows:
     news = beyond_slack(done)
     at = [s.column for s in news]
     problem = done.before.problem
-    residuals = problem.residuals(done.before.x, done.before.own)
+    residuals = problem.residuals(done.before.x, done.before.fitted_nuisance)
     channel = np.concatenate([m.channel for m in problem.measured])
     residual = np.concatenate(residuals)
     columns = np.concatenate([x[:, at] for x in done.screen.signatures.columns])

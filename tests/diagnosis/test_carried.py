@@ -61,19 +61,19 @@ def carried(part: TwinPart, free_starts: bool = False) -> tuple[CalibrationProbl
     network = compile_network(old().machine, part=part)
     new = on_network(old().problem, old().batches, network, free_starts)
     z = carried_z(old().problem, new, old().z)
-    return new, x_of(new.unknowns, z), carried_nuisances(old().problem, new, old().own)
+    return new, x_of(new.unknowns, z), carried_nuisances(old().problem, new, old().fitted_nuisance)
 
 
 def gap(problem: CalibrationProblem, x: Array, nuisance: list[Array]) -> float:
     """The largest change of a residual, in units of its noise."""
-    before = old().problem.residuals(old().x, old().own)
+    before = old().problem.residuals(old().x, old().fitted_nuisance)
     after = problem.residuals(x, nuisance)
     return max(float(np.abs(b - a).max()) for b, a in zip(before, after, strict=True))
 
 
 @pytest.mark.parametrize("free_starts", [False, True])
 def test_what_nobody_would_miss_changes_nothing(free_starts: bool) -> None:
-    assert max(float(np.abs(v).max()) for v in old().own) > 0.5  # else a mix-up would not show
+    assert max(float(np.abs(v).max()) for v in old().fitted_nuisance) > 0.5  # else a mix-up would not show
     problem, x, nuisance = carried(larger(), free_starts)
     assert gap(problem, x, nuisance) < 1e-3
 
@@ -96,7 +96,7 @@ def test_a_value_stays_where_its_prior_moves() -> None:
 
 def test_each_batchs_own_unknowns_are_carried_by_name() -> None:
     _, _, nuisance = carried(larger())
-    for before, after in zip(old().own, nuisance, strict=True):
+    for before, after in zip(old().fitted_nuisance, nuisance, strict=True):
         shaft, head, room, belt, *errors = before
         quill, cover, *bodies, own_room, lamp, own_belt, z = after
         assert (bodies, own_room, own_belt, [z]) == ([shaft, head], room, belt, errors)

@@ -101,7 +101,7 @@ def test_left_out_batches_are_predicted_as_by_fits_without_them() -> None:
         expected = own_start_estimated(done, k, fold.values)
         scale = noise[done.problem.measured[k].channel]
         assert np.abs((got - expected) / scale).max() < 0.15
-        inside = done.problem.residuals(done.x, done.own)[k]
+        inside = done.problem.residuals(done.x, done.fitted_nuisance)[k]
         assert np.abs(got / scale - inside).max() > 1.5 * np.abs((got - expected) / scale).max()
 
 

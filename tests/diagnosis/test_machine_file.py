@@ -380,9 +380,9 @@ def varying(sizes: list[float]) -> Fitted:
     """A fit in which the batches' deviations are these, in units of their prior."""
     done = fitted_with_own_powers(len(sizes))
     at = done.problem.nuisances.shared - 1
-    own = [np.concatenate([v[:at], [size], v[at + 1 :]]) for v, size in zip(done.own, sizes, strict=True)]
+    own = [np.concatenate([v[:at], [size], v[at + 1 :]]) for v, size in zip(done.fitted_nuisance, sizes, strict=True)]
     out = replace(done)
-    vars(out)["own"] = own
+    vars(out)["fitted_nuisance"] = own
     return out
 
 

@@ -157,7 +157,7 @@ def test_what_is_left_is_least(hyper: Hyper) -> None:
     size = np.repeat([hyper.structure, hyper.imperfections], [DRAWN, K - DRAWN])
     own_size = np.where(np.arange(OWN) < STARTS, hyper.starts, 1.0)
     along = np.vstack([d * size for d in marginal().along])
-    every = np.hstack([along, block_diag(*(n * own_size for n in marginal().own))])
+    every = np.hstack([along, block_diag(*(n * own_size for n in marginal().nuisance))])
     aim = np.concatenate([r @ np.append(-z, 1.0) for r in x])
     taken = np.linalg.solve(every.T @ every + np.eye(every.shape[1]), every.T @ aim)
     np.testing.assert_allclose(np.concatenate(left), aim - every @ taken)

@@ -165,7 +165,7 @@ def spindle_without_its_speed() -> tuple[Located, Mapping[str, tuple[np.ndarray,
         for b in batches
     ]
     fitted = baseline(blind, part, seen)
-    return locate(fitted.problem, fitted.x, fitted.own, seen), {
+    return locate(fitted.problem, fitted.x, fitted.fitted_nuisance, seen), {
         b.batch_id: (b.time_s, b.values("spindle_rpm")) for b in batches
     }
 

@@ -289,7 +289,7 @@ class CalibrationProblem:
         for part in self._together(len(numbers)):
             some = self.only(part)
             own = [nuisance[b] for b in part]
-            _, *slopes = sensitivities(self.network, self.values_at(x), *some.own(own), Selected(numbers))
+            _, *slopes = sensitivities(self.network, self.values_at(x), *some.inputs_at(own), Selected(numbers))
             slope = np.concatenate(slopes, axis=-1)
             for b, m in enumerate(some.measured):
                 yield (m.of(slope[:, b]) / self.noise[m.channel]).T
@@ -306,7 +306,7 @@ class CalibrationProblem:
         kept = self._last.get(_key(x, nuisance))
         if kept is not None:
             return [block.residual for block in kept]
-        series = simulate(self.network, self.values_at(x), *self.own(nuisance)).shown[0]
+        series = simulate(self.network, self.values_at(x), *self.inputs_at(nuisance)).shown[0]
         return [self._residual(m, s, v) for m, s, v in zip(self.measured, series, nuisance, strict=True)]
 
     @cached_property
@@ -315,7 +315,7 @@ class CalibrationProblem:
         laws = [h.law for h in self.network.heats if not h.disabled]
         return [tuple(w.name for w in laws if k in w.parameters.values()) for k in self.nuisances.parameters]
 
-    def own_deviations(self, nuisance: Sequence[Array]) -> Array:
+    def nuisance_offsets(self, nuisance: Sequence[Array]) -> Array:
         """Offsets of each batch's own parameters (B, varying), in fitting coordinates."""
         first = self.nuisances.shared - len(self.nuisances.parameters)
         return np.array([v[first : self.nuisances.shared] for v in nuisance]) * self.nuisances.deviation
@@ -323,7 +323,7 @@ class CalibrationProblem:
     def _own_times(self, nuisance: Sequence[Array]) -> dict[str, Array]:
         """Each batch's own factor (B,) of the heats that differ from run to run, by law."""
         times: dict[str, Array] = {}
-        for names, deviation in zip(self._heats, self.own_deviations(nuisance).T, strict=True):
+        for names, deviation in zip(self._heats, self.nuisance_offsets(nuisance).T, strict=True):
             for name in names:
                 times[name] = times.get(name, 1.0) * np.exp(deviation)
         return times
@@ -349,7 +349,7 @@ class CalibrationProblem:
     def _blocks(self, x: Array, nuisance: Sequence[Array]) -> Iterator[Block]:
         numbers = list(dict.fromkeys([*self.network.free.tolist(), *self.nuisances.parameters.tolist()]))
         selected = Selected(numbers, len(self.nuisances.start_K) > 0, self.nuisances.surroundings.tolist())
-        simulation, *slopes = sensitivities(self.network, self.values_at(x), *self.own(nuisance), selected)
+        simulation, *slopes = sensitivities(self.network, self.values_at(x), *self.inputs_at(nuisance), selected)
         series = simulation.shown[0]
         slope = np.concatenate(slopes, axis=-1)  # (Q, B, K, C)
         free = len(self.unknowns)
@@ -362,7 +362,7 @@ class CalibrationProblem:
                 m.batch_id, self._residual(m, series[b], nuisance[b]), whitened[:, :free], np.hstack(own), m.channel
             )
 
-    def own(self, nuisance: Sequence[Array]) -> tuple[Inputs, Array]:
+    def inputs_at(self, nuisance: Sequence[Array]) -> tuple[Inputs, Array]:
         """The inputs with the heats and surroundings of the batches' nuisances, and start temperatures (1, B, N)."""
         bodies = len(self.nuisances.start_K)
         shared = np.array([v[: self.nuisances.shared] for v in nuisance]).reshape(len(nuisance), -1)

@@ -90,7 +90,7 @@ def test_signatures_are_what_a_little_of_the_mechanism_changes() -> None:
     base = problem.residuals(done.before.x, done.before.nuisance)
     change = np.concatenate(difference(done.before, s.candidate.applied(done.before.part, values), base))
     channel = np.concatenate([m.channel for m in problem.measured])
-    residual = np.concatenate(problem.residuals(done.before.x, done.before.own))
+    residual = np.concatenate(problem.residuals(done.before.x, done.before.fitted_nuisance))
     for c in np.unique(channel):
         own = channel == c
         change[own] = (change[own] - change[own].mean()) / np.sqrt(np.mean(residual[own] ** 2))
