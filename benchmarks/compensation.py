@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 
 from compensation.connectors import open_sink, open_source
+from compensation.connectors.mqtt import MqttExchange
 from compensation.contracts import Sample
-from compensation.exchange import MqttExchange
 from compensation.runtime import AxisModel, Compensator
 from compensation.safety import Limits
 from compensation.serving import serve

@@ -25,7 +25,7 @@ from pathlib import Path
 import openpyxl
 import pandas as pd
 
-from compensation.connectors.messages import Names, Reports, sample_from_json
+from compensation.connectors.messages import Decoder
 from compensation.connectors.streams import LineParser
 from data.errors import InputError
 from data.machine import Form, parse_machine
@@ -192,12 +192,12 @@ class MachineFiles:
 
 
 class Messages:
-    """`sample_from_json`: ValueError."""
+    """`Decoder.sample`: ValueError."""
 
     allowed: tuple[type[Exception], ...] = (ValueError,)
 
     def __init__(self) -> None:
-        self._names, self._reports = Names(parse_machine(MACHINE, "fuzz")), Reports()
+        self._decoder = Decoder(parse_machine(MACHINE, "fuzz"))
         nested = {"time_s": 1e9, "values": {"front": 25.5, "room": None, "spindle_rpm": 4000}, "readings_um": {"z": 3}}
         flat = {"timestamp": "2026-01-01T00:01:40Z", "front": "25.5", "z": 3.0, "y": 100}
         self._good = [json.dumps(m).encode() for m in (nested, flat)]
@@ -208,10 +208,10 @@ class Messages:
     def run(self, given: bytes) -> None:
         for arrival_s in (None, 1e9):
             try:
-                sample_from_json(given, self._names, self._reports, "fuzz", arrival_s)
+                self._decoder.sample(given, "fuzz", arrival_s)
             except ValueError as error:
                 _one_line(error)
-        sample_from_json(given.decode("utf-8", "replace"), self._names, self._reports, "fuzz", 1e9)
+        self._decoder.sample(given.decode("utf-8", "replace"), "fuzz", 1e9)
 
 
 class Lines:

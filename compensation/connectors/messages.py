@@ -6,9 +6,9 @@ import datetime as dt
 import math
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from compensation.contracts import Correction, Sample
 from data.errors import WorkError, closest
@@ -128,18 +128,20 @@ class Target(NamedTuple):
     offset: float = 0.0
 
 
-class Names:
-    """Finds the channel that a name from outside means, and its conversion into the machine file's unit.
+class Decoder:
+    """Samples from the names, numbers and texts that arrive, in the units of the machine file.
 
     A channel goes by its own name or by the `column` of the machine file. A value under the name is in `unit`, one
     under the column in `unit_in_file`. Where both are the same text, a CSV file means the column, all others the name.
+    A value that is no number, or whose channel is unknown, is left out and reported, `first` times in a row.
 
     Raises:
         InputError: a unit that cannot be converted.
     """
 
-    def __init__(self, machine: Machine) -> None:
+    def __init__(self, machine: Machine, first: int = 1) -> None:
         self.channels = tuple(machine.channels)
+        self._reports = Reports(first)
         self._by_name: dict[str | int, Target] = {}
         self._by_column: dict[str | int, Target] = {}
         for name, part in machine.channels.items():
@@ -152,80 +154,57 @@ class Names:
             for exact, target in list(known.items()):
                 known.setdefault(exact if isinstance(exact, int) else normalise(exact), target)
 
-    def of_column(self, header: str | int) -> Target | None:
-        """The channel of a column of a CSV file, or None."""
-        return self._find(header, self._by_column, self._by_name)
-
-    def of_key(self, key: str) -> Target | None:
-        """The channel of a key of a message, or None."""
-        return self._find(key, self._by_name, self._by_column)
-
-    @staticmethod
-    def _find(key: str | int, *tables: Mapping[str | int, Target]) -> Target | None:
+    def target(self, key: str | int, column: bool = False) -> Target | None:
+        """The channel of a key of a message, or of a `column` of a CSV file; None where there is none."""
+        tables = (self._by_column, self._by_name) if column else (self._by_name, self._by_column)
         spellings = [key] if isinstance(key, int) else [key, key.strip(), normalise(key)]
         return next((table[s] for table in tables for s in spellings if s in table), None)
 
+    def numbers(
+        self, cells: Iterable[tuple[str, Target | None, object]], where: str, decimal: str = "."
+    ) -> tuple[dict[str, float], dict[str, float]]:
+        """Values and readings by channel, from key, channel and number of each cell."""
+        values: dict[str, float] = {}
+        readings: dict[str, float] = {}
+        for key, target, given in cells:
+            if target is None:
+                unknown = f"{where}: unknown channel {excerpt(key)}: {closest(key[:60], self.channels)}"
+                self._reports.skipped(key, unknown)
+            elif not is_missing(given):
+                value = number(given, decimal)
+                if value is None:
+                    self._reports.skipped(key, f"{where}: {key}: got {excerpt(given)}, expected a number")
+                    continue
+                self._reports.read(key)
+                (readings if target.is_reading else values)[target.channel] = value * target.factor + target.offset
+        return values, readings
 
-def sample_from_json(
-    text: str | bytes | bytearray, names: Names, reports: Reports, where: str, arrival_s: float | None
-) -> Sample:
-    """A sample from one JSON object.
+    def sample(self, text: str | bytes | bytearray, where: str, arrival_s: float | None) -> Sample:
+        """A sample from one JSON object.
 
-    Either ``{"time_s": …, "values": {channel: number}, "readings_um": {error channel: number}}`` or flat, with the
-    channels next to the time; a number under an error channel is a reading in both. The time stands under `time_s`,
-    `time` or `timestamp`, as Unix time in s or as an ISO time stamp; without one the sample has `arrival_s`. A value
-    that is no number, or whose channel is unknown, is left out with one report.
+        Either ``{"time_s": …, "values": {channel: number}, "readings_um": {error channel: number}}`` or flat, with the
+        channels next to the time; a number under an error channel is a reading in both. The time stands under `time_s`,
+        `time` or `timestamp`, as Unix time in s or as an ISO time stamp; without one the sample has `arrival_s`.
 
-    Raises:
-        ValueError: not a JSON object, or no time and no `arrival_s`; the message says what was got and expected.
-    """
-    try:
-        given = from_json(text)
-    except ValueError:
-        given = None
-    if not isinstance(given, dict):
-        raise ValueError(f"got {excerpt(text)}, expected one JSON object")
-    stamps = [given.pop(key) for key in TIME_KEYS if key in given]
-    if stamps:
-        time_s = unix_time_s(stamps[0])
-    elif arrival_s is not None:
-        time_s = arrival_s
-    else:
-        raise ValueError(f"got {excerpt(text)}, expected the key 'time_s'")
-    nested = [given[key] for key in ("values", "readings_um") if key in given]
-    for part in nested:
-        if not isinstance(part, dict):
-            raise ValueError(f"got {excerpt(part)} under 'values' or 'readings_um', expected an object")
-    values: dict[str, float] = {}
-    readings_um: dict[str, float] = {}
-    for key, cell in (item for part in nested or [given] for item in part.items()):
-        take(names.of_key(key), key, cell, names, reports, where, values, readings_um)
-    return Sample(time_s, values, readings_um)
-
-
-def take(
-    target: Target | None,
-    key: str,
-    given: object,
-    names: Names,
-    reports: Reports,
-    where: str,
-    values: dict[str, float],
-    readings: dict[str, float],
-    decimal: str = ".",
-) -> None:
-    """Put a number under its channel into `values` or `readings`; report an unknown channel and what is no number."""
-    if target is None:
-        reports.skipped(key, f"{where}: unknown channel {excerpt(key)}: {closest(key[:60], names.channels)}")
-        return
-    if is_missing(given):
-        return
-    value = number(given, decimal)
-    if value is None:
-        reports.skipped(key, f"{where}: {key}: got {excerpt(given)}, expected a number")
-        return
-    reports.read(key)
-    (readings if target.is_reading else values)[target.channel] = value * target.factor + target.offset
+        Raises:
+            ValueError: not a JSON object, or no time and no `arrival_s`; the message says what was got and expected.
+        """
+        try:
+            given = from_json(text)
+        except ValueError:
+            given = None
+        if not isinstance(given, dict):
+            raise ValueError(f"got {excerpt(text)}, expected one JSON object")
+        stamps = [given.pop(key) for key in TIME_KEYS if key in given]
+        time_s = unix_time_s(stamps[0]) if stamps else arrival_s
+        if time_s is None:
+            raise ValueError(f"got {excerpt(text)}, expected the key 'time_s'")
+        nested = [given[key] for key in ("values", "readings_um") if key in given]
+        for part in nested:
+            if not isinstance(part, dict):
+                raise ValueError(f"got {excerpt(part)} under 'values' or 'readings_um', expected an object")
+        cells = ((key, self.target(key), cell) for part in nested or [given] for key, cell in part.items())
+        return Sample(time_s, *self.numbers(cells, where))
 
 
 # ----- corrections
@@ -241,19 +220,6 @@ def check_deliverable(correction: Correction, where: str) -> None:
         for axis, value in parts.items():
             if not math.isfinite(value):
                 raise WorkError(f"{where}: axis {axis!r}: {what} is {value}, expected a finite number; nothing is sent")
-
-
-def correction_record(correction: Correction) -> dict[str, Any]:
-    """The fields of a correction as plain data, for JSON."""
-    return {
-        "time_s": float(correction.time_s),
-        "offset_um": {axis: float(v) for axis, v in correction.offset_um.items()},
-        "slope_um_per_m": {axis: float(v) for axis, v in correction.slope_um_per_m.items()},
-        "state": dict(correction.state),
-        "reasons": dict(correction.reasons),
-        "heartbeat": correction.heartbeat,
-        "valid_until_s": float(correction.valid_until_s),
-    }
 
 
 def overall_state(correction: Correction) -> str:

@@ -1,4 +1,4 @@
-"""MQTT: samples from topics of a broker, corrections to topics of a broker."""
+"""MQTT: samples from topics of a broker, corrections to topics of a broker; and the machine's side of both."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import asdict
+from queue import Empty, SimpleQueue
 from typing import Any, ClassVar
 from urllib.parse import urlsplit
 
@@ -17,17 +19,9 @@ from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
-from compensation.connectors.messages import (
-    BLOCK_S,
-    Names,
-    Reports,
-    correction_record,
-    overall_state,
-    sample_from_json,
-    take,
-)
+from compensation.connectors.messages import BLOCK_S, Decoder, Reports, overall_state
 from compensation.connectors.network import Delivery, Feed, Link, NetworkAddress, credentials
-from compensation.contracts import Correction
+from compensation.contracts import Correction, Sample
 from data.errors import InputError, WorkError
 from data.machine import Machine
 
@@ -37,6 +31,8 @@ COLLECT_S = 1.0
 _FIRST_CONNECTION_S = 3.0  # that a new sink waits for its broker, before the first write
 _PORTS = {"mqtt": 1883, "mqtts": 8883}
 _MAX_PAYLOAD_BYTES = 1_000_000
+_ANSWER_S, _AGAIN_S = 30.0, 1.0  # that an exchange waits, and between two tries
+_ONE_LEVEL = str.maketrans("/+#", "___")  # of a topic
 _REPORTED = 3  # of an unbroken row of unreadable payloads of one topic
 
 
@@ -128,7 +124,7 @@ class MqttSource(Feed[_Link]):
 
     | topic | payload |
     |---|---|
-    | `PREFIX/sample` | one JSON object with all channels, see `messages.sample_from_json`; without a time: at arrival |
+    | `PREFIX/sample` | one JSON object with all channels, see `messages.Decoder.sample`; without a time: at arrival |
     | `PREFIX/channel/NAME` | a number, in the channel's unit of the machine file |
     | `PREFIX/reading/AXIS` | a number, the measured error in the unit of the machine file (µm) |
 
@@ -145,18 +141,17 @@ class MqttSource(Feed[_Link]):
     """
 
     def __init__(self, address: str, machine: Machine) -> None:
-        link = _Link(address, ("interval_s",), self._subscribe)
+        ends = ("sample", "channel/#", "reading/#")
+        link = _Link(
+            address, ("interval_s",), lambda: self._client.subscribe([(f"{self._prefix}/{end}", 1) for end in ends])
+        )
         super().__init__(link)
         self._interval_s = link.address.seconds("interval_s", COLLECT_S)
-        self._names = Names(machine)
         self._errors = machine.names("error")
-        self._payloads, self._cells = Reports(_REPORTED), Reports(_REPORTED)
+        self._payloads, self._decoder = Reports(_REPORTED), Decoder(machine, _REPORTED)
         self._prefix, self._client = link.prefix, link.client
         self._client.on_message = self._on_message
         link.start()
-
-    def _subscribe(self) -> None:
-        self._client.subscribe([(f"{self._prefix}/{end}", 1) for end in ("sample", "channel/#", "reading/#")])
 
     def _on_message(self, client: Client, userdata: Any, message: MQTTMessage) -> None:
         topic = message.topic
@@ -166,7 +161,8 @@ class MqttSource(Feed[_Link]):
             if len(message.payload) > _MAX_PAYLOAD_BYTES:
                 raise ValueError(f"got {len(message.payload)} bytes, expected {_MAX_PAYLOAD_BYTES} at most")
             if kind == "sample":
-                self._whole(message, where)
+                arrival_s = None if message.retain else time.time()
+                self.inbox.put(self._decoder.sample(message.payload, where, arrival_s))
             elif not message.retain:
                 self._single(kind, name, message.payload.decode("utf-8"), where)
         except ValueError as error:  # also what is no UTF-8
@@ -174,17 +170,11 @@ class MqttSource(Feed[_Link]):
         else:
             self._payloads.read(topic)
 
-    def _whole(self, message: MQTTMessage, where: str) -> None:
-        arrival_s = None if message.retain else time.time()
-        self.inbox.put(sample_from_json(message.payload, self._names, self._cells, where, arrival_s))
-
     def _single(self, kind: str, name: str, text: str, where: str) -> None:
-        target = self._names.of_key(name)
+        target = self._decoder.target(name)
         if kind == "reading" and (target is None or not target.is_reading):
             raise ValueError(f"got a reading of {name!r}, expected an error channel: {', '.join(self._errors)}")
-        values: dict[str, float] = {}
-        readings: dict[str, float] = {}
-        take(target, name, text, self._names, self._cells, where, values, readings)
+        values, readings = self._decoder.numbers([(name, target, text)], where)
         if values or readings:
             self.inbox.collect(values, readings, self._interval_s)
 
@@ -220,10 +210,10 @@ class MqttSink(Delivery[_Link]):
         link.settled.wait(_FIRST_CONNECTION_S)
 
     def send(self, correction: Correction) -> None:
-        root, record = f"{self._prefix}/correction", correction_record(correction)
+        root, record = f"{self._prefix}/correction", asdict(correction)
         messages = [(root, json.dumps(record, ensure_ascii=False), True)]  # first, as a control acts on it
         messages += [
-            (f"{root}/{_level(axis)}/{key}", str(value), False)
+            (f"{root}/{axis.translate(_ONE_LEVEL)}/{key}", str(value), False)
             for key in ("offset_um", "slope_um_per_m", "state")
             for axis, value in record[key].items()
         ]
@@ -250,6 +240,49 @@ class MqttSink(Delivery[_Link]):
         raise WorkError(f"{self.link.where}: {why}; check the broker")
 
 
-def _level(axis: str) -> str:
-    """An axis as one level of a topic."""
-    return axis.translate(str.maketrans("/+#", "___"))
+class MqttExchange:
+    """The machine's side, for rehearsals: sends `PREFIX/sample` and waits for the `PREFIX/correction` of that time.
+
+    Raises:
+        WorkError: the broker does not answer, or nobody compensates there.
+    """
+
+    def __init__(self, address: str) -> None:
+        parts = urlsplit(address)
+        self.address, self.prefix = address, parts.path.strip("/")
+        self._answers: SimpleQueue[dict[str, Any]] = SimpleQueue()
+        self._ready: SimpleQueue[bool] = SimpleQueue()
+        self._heard = False
+        self._client = prompt_client()
+        self._client.on_connect = lambda client, *_: client.subscribe(f"{self.prefix}/correction", 1)
+        self._client.on_subscribe = lambda *_: self._ready.put(True)
+        self._client.on_message = lambda _, __, message: self._answers.put(json.loads(message.payload))
+        try:
+            self._client.connect(parts.hostname or "127.0.0.1", parts.port or 1883)
+            self._client.loop_start()
+            self._ready.get(timeout=_ANSWER_S)
+        except (OSError, Empty) as error:
+            raise WorkError(f"broker {address}: does not answer ({error}); start it, or give another address") from None
+
+    def __call__(self, sample: Sample) -> Correction:
+        until_s, text, sent_s = time.monotonic() + _ANSWER_S, json.dumps(asdict(sample)), -_AGAIN_S
+        while (now_s := time.monotonic()) < until_s:
+            if now_s - sent_s >= _AGAIN_S and (sent_s < 0 or not self._heard):  # it may not have subscribed yet
+                self._client.publish(f"{self.prefix}/sample", text, 1)
+                sent_s = now_s
+            try:
+                got = self._answers.get(timeout=_AGAIN_S)
+            except Empty:
+                continue
+            if abs(got["time_s"] - sample.time_s) < 1e-3:
+                self._heard = True
+                return Correction(**got)
+        raise WorkError(
+            f"{self.address}: no correction within {_ANSWER_S:g} s; start `thermodrift compensate --replay` with the "
+            "same address"
+        )
+
+    def close(self) -> None:
+        """Disconnects."""
+        self._client.disconnect()
+        self._client.loop_stop()

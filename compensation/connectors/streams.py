@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
+from dataclasses import asdict
 from pathlib import Path
 from typing import BinaryIO, TextIO
 
@@ -18,21 +19,18 @@ from compensation.connectors.messages import (
     BLOCK_S,
     IDLE_S,
     TIME_KEYS,
-    Names,
+    Decoder,
     Reports,
     Target,
     check_deliverable,
-    correction_record,
     excerpt,
-    sample_from_json,
-    take,
     unix_time_s,
     warn,
 )
 from compensation.contracts import Correction, Sample
 from data.errors import InputError, WorkError
 from data.machine import Machine
-from data.readers.csv import find_decimal, find_separator, normalise
+from data.readers.csv import find_decimal, find_separator, normalise, split
 from data.units import TIME_UNITS_S
 
 POLL_S = 0.2  # between two looks at a growing file
@@ -70,10 +68,13 @@ class _Lines:
 class _Columns:
     """The header of a CSV table: which cell is the time and where the others go."""
 
-    def __init__(self, header: Sequence[str] | None, separator: str, machine: Machine, names: Names) -> None:
+    def __init__(self, header: Sequence[str] | None, separator: str, machine: Machine, decoder: Decoder) -> None:
         """`header` None: the machine's recordings have no header, and columns are positions."""
         clock = machine.recording.time
-        titles: Sequence[str | int] = range(_headless_width(machine)) if header is None else header
+        titles: list[str | int] = [*(header or ())]
+        if header is None:
+            columns = [clock.column, *(part.column for part in machine.channels.values())]
+            titles = [*range(1 + max((c for c in columns if isinstance(c, int)), default=0))]
         folded = [t if isinstance(t, int) else normalise(t) for t in titles]
         wanted = [c if isinstance(c, int) else normalise(c) for c in (clock.column, *TIME_KEYS)]
         self.width = None if header is None else len(header)
@@ -93,7 +94,7 @@ class _Columns:
         for i, title in enumerate(titles):
             if i in (self.time, self.date):
                 continue
-            target = names.of_column(title)
+            target = decoder.target(title, column=True)
             if target is not None and target.channel not in taken:
                 self.targets[i] = target
                 taken.add(target.channel)
@@ -101,16 +102,11 @@ class _Columns:
                 self.unknown.append(str(title).strip())
 
 
-def _headless_width(machine: Machine) -> int:
-    columns = [machine.recording.time.column, *(part.column for part in machine.channels.values())]
-    return 1 + max((c for c in columns if isinstance(c, int)), default=0)
-
-
 class LineParser:
-    """Samples from lines, each a JSON object (`sample_from_json`) or a row of one CSV table.
+    """Samples from lines, each a JSON object (`Decoder.sample`) or a row of one CSV table.
 
     The first line that is no JSON object is the table's header, unless the machine file says ``header: false``. Its
-    columns are channels (by `column` or name, see `Names`) and one time: the machine file's time column, or `time_s`,
+    columns are channels (by `column` or name, see `Decoder`) and one time: the machine file's time column, or `time_s`,
     `time` or `timestamp` (Unix seconds or ISO). The separator is found from the header; with one other than the comma,
     a comma may be the decimal mark. Lines that begin with ``# `` are comments. An unreadable line is skipped with one
     line on standard error.
@@ -122,12 +118,11 @@ class LineParser:
     def __init__(self, machine: Machine, where: str) -> None:
         self._machine = machine
         self._where = where
-        self._names = Names(machine)
+        self._decoder = Decoder(machine)
         self._columns: _Columns | None = None
         self._before: _Columns | None = None  # of the file that this one replaces
         self._broken_header = False
         self._lines = Reports(_REPORTED_LINES)
-        self._cells = Reports()
 
     def restart(self) -> None:
         """Expect a header again: another file takes the place of the one before."""
@@ -136,13 +131,17 @@ class LineParser:
 
     def sample(self, line: bytes, row: int) -> Sample | None:
         """The sample of a line; None for a header, a comment, an empty or an unreadable line. `row` is its number."""
-        text = _decoded(line).strip("\r\n\ufeff\0 ")
+        try:
+            text = line.decode("utf-8")
+        except UnicodeDecodeError:
+            text = line.decode("cp1252", "replace")  # loggers on Windows write ° and µ like this
+        text = text.strip("\r\n\ufeff\0 ")
         if not text or text.startswith("# "):
             return None
         where = f"{self._where} line {row}"
         try:
             if text.startswith("{"):
-                sample: Sample | None = sample_from_json(text, self._names, self._cells, where, None)
+                sample: Sample | None = self._decoder.sample(text, where, None)
             else:
                 sample = self._row(text, where)
         except ValueError as error:
@@ -158,14 +157,14 @@ class LineParser:
     def _row(self, text: str, where: str) -> Sample | None:
         columns = self._columns
         if columns is None and not self._machine.recording.header:
-            columns = self._columns = _Columns(None, find_separator([text], []), self._machine, self._names)
+            columns = self._columns = _Columns(None, find_separator([text], []), self._machine, self._decoder)
         if columns is None:
             if self._header(text, where):
                 return None
             columns = self._columns
         if columns is None:
             raise ValueError(f"got {excerpt(text)} below a header without a time or a known channel")
-        return self._cells_to_sample(_split(text, columns.separator), columns, where)
+        return self._cells_to_sample(split(text, columns.separator), columns, where)
 
     def _header(self, text: str, where: str) -> bool:
         """Take a line as the header; False: it is a row of the table before, whose file was emptied under its writer.
@@ -175,32 +174,27 @@ class LineParser:
         """
         if self._broken_header:
             return False
-        columns = _Columns(*self._titles(text), self._machine, self._names)
+        clock = self._machine.recording.time.column
+        named = [c for c in (clock, *(part.column for part in self._machine.channels.values())) if isinstance(c, str)]
+        separator = find_separator([text], [*self._decoder.channels, *named, *TIME_KEYS])
+        columns = _Columns(split(text, separator), separator, self._machine, self._decoder)
         if columns.time is not None and columns.targets:
             self._columns = columns
             if columns.unknown:
                 unknown = ", ".join(columns.unknown[:10])
                 warn(f"{where}: columns that are no channel are left out: {unknown}; list them under ignore")
             return True
-        if self._before is not None and len(_split(text, self._before.separator)) == self._before.width:
+        if self._before is not None and len(split(text, self._before.separator)) == self._before.width:
             self._columns = self._before
             return False
-        clock = self._machine.recording.time.column
         missing = "time column" if columns.time is None else "column of a channel"
-        expected = f"{clock!r}, {', '.join(TIME_KEYS)}" if columns.time is None else ", ".join(self._names.channels)
+        expected = f"{clock!r}, {', '.join(TIME_KEYS)}" if columns.time is None else ", ".join(self._decoder.channels)
         message = f"{where}: the header has no {missing}: got {excerpt(text)}, expected one of {expected}"
         if self._before is None:
             raise InputError(f"{message}; correct the header or the machine file")
         self._broken_header = True
         warn(f"{message}; all its rows are skipped")
         return True
-
-    def _titles(self, text: str) -> tuple[list[str], str]:
-        clock = self._machine.recording.time.column
-        columns = [c for part in self._machine.channels.values() if isinstance(c := part.column, str)]
-        hints = [*self._names.channels, *columns, *TIME_KEYS, *([clock] if isinstance(clock, str) else [])]
-        separator = find_separator([text], hints)
-        return _split(text, separator), separator
 
     def _cells_to_sample(self, cells: list[str], columns: _Columns, where: str) -> Sample:
         width, time = columns.width, columns.time
@@ -212,85 +206,81 @@ class LineParser:
         given = {i: cells[i] for i in columns.targets}
         if columns.separator != "," and find_decimal([list(given.values())]) == ",":
             columns.decimal = ","  # of the whole table: a cell such as "n.a." has no say
-        values: dict[str, float] = {}
-        readings: dict[str, float] = {}
-        for i, cell in given.items():
-            target = columns.targets[i]
-            take(target, target.channel, cell, self._names, self._cells, where, values, readings, columns.decimal)
-        return Sample(time_s, values, readings)
-
-
-def _decoded(line: bytes) -> str:
-    try:
-        return line.decode("utf-8")
-    except UnicodeDecodeError:
-        return line.decode("cp1252", "replace")  # loggers on Windows write ° and µ like this
-
-
-def _split(text: str, separator: str) -> list[str]:
-    try:
-        return next(csv.reader([text], delimiter=separator), [])
-    except csv.Error as error:
-        raise ValueError(f"got {excerpt(text)}, expected cells between {separator!r} ({error})") from None
+        taken = ((columns.targets[i].channel, columns.targets[i], cell) for i, cell in given.items())
+        return Sample(time_s, *self._decoder.numbers(taken, where, columns.decimal))
 
 
 # ----- sources
 
 
-class StandardInput:
-    """Samples from standard input, one JSON object or CSV row a line (`LineParser`); ends with the stream."""
+class _LineSource:
+    """A source of lines."""
+
+    def __init__(self, machine: Machine, where: str) -> None:
+        self._parser, self._lines, self._stop = LineParser(machine, where), _Lines(), threading.Event()
+
+    def _chunks(self) -> Iterator[bytes | None]:
+        """What has arrived, None in silence; empty at the end."""
+        raise NotImplementedError
+
+    def samples(self) -> Iterator[Sample | None]:
+        """Samples as their lines are written, None in silence.
+
+        Raises:
+            InputError: the first header of a CSV table has no time or no known channel.
+        """
+        for data in self._chunks():
+            some = False
+            for line in () if data is None else self._lines.feed(data) if data else self._lines.unfinished():
+                sample = self._parser.sample(line, self._lines.number)
+                if sample is not None and not self._stop.is_set():
+                    some = True
+                    yield sample
+            if not some and data != b"":
+                yield None
+
+    def close(self) -> None:
+        """Stop."""
+        self._stop.set()
+
+
+class StandardInput(_LineSource):
+    """Samples from standard input, one JSON object or CSV row a line (`LineParser`); ends with the stream, which stays
+    open after `close`."""
 
     def __init__(self, address: str, machine: Machine, stream: BinaryIO | None = None) -> None:
-        self._parser = LineParser(machine, "standard input")
+        super().__init__(machine, "standard input")
         stream = sys.stdin.buffer if stream is None else stream
         self._stream = getattr(stream, "raw", stream)  # Python cannot end while a thread waits in a buffered one
-        self._chunks: queue.Queue[bytes] = queue.Queue(maxsize=16)  # a full one holds the writer back
-        self._closed = False
+        self._read_ahead: queue.Queue[bytes] = queue.Queue(maxsize=16)  # a full one holds the writer back
         # a thread, since no wait for a stream ends after a given time on all systems
         threading.Thread(target=self._read, name="standard input", daemon=True).start()
 
     def _read(self) -> None:
         read1: Callable[[int], bytes] = getattr(self._stream, "read1", self._stream.read)
-        while not self._closed:
+        while not self._stop.is_set():
             try:
                 data = read1(_CHUNK_BYTES) or b""
             except (OSError, ValueError) as error:  # ValueError: closed by somebody else
                 warn(f"standard input: cannot be read ({error}); taken as its end")
                 data = b""
-            self._chunks.put(data)
+            self._read_ahead.put(data)
             if not data:
                 return
 
-    def samples(self) -> Iterator[Sample | None]:
-        """Samples as they arrive, None in silence.
-
-        Raises:
-            InputError: the header of a CSV table has no time or no known channel.
-        """
-        lines = _Lines()
-        while not self._closed:
+    def _chunks(self) -> Iterator[bytes | None]:
+        while not self._stop.is_set():
             try:
-                data = self._chunks.get(timeout=IDLE_S)
+                data = self._read_ahead.get(timeout=IDLE_S)
             except queue.Empty:
                 yield None
                 continue
-            some = False
-            for line in lines.feed(data) if data else lines.unfinished():
-                sample = self._parser.sample(line, lines.number)
-                if sample is not None and not self._closed:
-                    some = True
-                    yield sample
+            yield data
             if not data:
                 return
-            if not some:
-                yield None
-
-    def close(self) -> None:
-        """Stop; the stream itself stays open."""
-        self._closed = True
 
 
-class CsvSource:
+class CsvSource(_LineSource):
     """Samples from a CSV file, read from its beginning (see `LineParser` for its columns).
 
     With `follow` the source then waits for further rows. It follows a file that is truncated, or replaced by another
@@ -302,11 +292,9 @@ class CsvSource:
     """
 
     def __init__(self, address: str, machine: Machine, *, follow: bool = True) -> None:
+        super().__init__(machine, address)
         self._path = Path(address)
         self._follow = follow
-        self._parser = LineParser(machine, address)
-        self._stop = threading.Event()
-        self._lines = _Lines()
         self._file: BinaryIO | None = None
         if not self._open():
             if not follow or not self._path.parent.is_dir():
@@ -327,25 +315,13 @@ class CsvSource:
             raise InputError(f"source {self._path}: cannot be read ({error.strerror}); give a CSV file") from None
         return True
 
-    def samples(self) -> Iterator[Sample | None]:
-        """Samples as their rows are written, None in silence.
-
-        Raises:
-            InputError: the first header has no time or no known channel.
-        """
+    def _chunks(self) -> Iterator[bytes | None]:
         while not self._stop.is_set():
             data = self._next_bytes()
-            ended = not data and not self._follow
-            some = False
-            for line in self._lines.unfinished() if ended else self._lines.feed(data):
-                sample = self._parser.sample(line, self._lines.number)
-                if sample is not None and not self._stop.is_set():
-                    some = True
-                    yield sample
-            if ended:
+            if not data and not self._follow:
+                yield data
                 break
-            if not some:
-                yield None
+            yield data or None
             if not data:
                 self._stop.wait(POLL_S)
         self._release()
@@ -399,7 +375,7 @@ class CsvSource:
 
     def close(self) -> None:
         """Stop and close the file."""
-        self._stop.set()
+        super().close()
         self._release()
 
 
@@ -465,7 +441,7 @@ class StandardOutput:
             WorkError: nobody reads it, or a number is not finite.
         """
         check_deliverable(correction, "standard output")
-        self._writer.write(json.dumps(correction_record(correction), ensure_ascii=False) + "\n")
+        self._writer.write(json.dumps(asdict(correction), ensure_ascii=False) + "\n")
 
     def close(self) -> None:
         """Stop; the stream itself stays open."""

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pandas as pd
 
-from compensation.exchange import MqttExchange
 from compensation.exports import EXPORTS
 from compensation.exports.base import Export, ExportedAxis
 from compensation.exports.region import checks_program, trust_program
@@ -174,6 +173,8 @@ def rehearse_models(
     if through is None:
         running = compensator(models, given, period_s, lambda line: None)
         return rehearse(batches, axes, lambda s: running.take(s, s.time_s), *how)
+    from compensation.connectors.mqtt import MqttExchange  # loads paho
+
     with closing(MqttExchange(through)) as exchange:
         return rehearse(batches, axes, exchange, *how)
 
