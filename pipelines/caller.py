@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from data.errors import InputError
 
@@ -21,13 +21,6 @@ RETRIES = 2  # for steps that touch a share or a store, where a second try can s
 RETRY_DELAY_S = 2.0  # for a share or a store to come back
 
 
-class Caller(Protocol):
-    """How steps run."""
-
-    def map(self, step: str, work: Callable[[T], R], items: Sequence[T], retries: int = 0) -> list[R]:
-        """`work` on every item, results in the items' order; an exception of any of them is raised."""
-
-
 class DirectCaller:
     """Steps as plain calls, in as many threads as there are `lanes`.
 
@@ -39,6 +32,7 @@ class DirectCaller:
         self.done, self._working, self._lanes = done, working, lanes
 
     def map(self, step: str, work: Callable[[T], R], items: Sequence[T], retries: int = 0) -> list[R]:
+        """`work` on every item, results in the items' order; an exception of any of them is raised."""
         from threadpoolctl import threadpool_limits
 
         from data.processes import in_threads

@@ -14,8 +14,8 @@ from data.errors import InputError
 from data.files import check_folder
 from data.machine import Machine, load_machine, parse_machine
 from diagnosis.findings.schema import read_findings
-from pipelines.caller import RETRIES, Caller, DirectCaller, Done, Say
-from pipelines.jobs.diagnosing import FILES, FINDINGS, PLAN, Diagnose, DiagnosisOutcome, DiagnosisRequest, finished
+from pipelines.caller import RETRIES, DirectCaller, Done, Say
+from pipelines.jobs.diagnosing import FILES, FINDINGS, PLAN, DiagnosisOutcome, DiagnosisRequest, finished
 from pipelines.jobs.inputs import Inputs, Recorded, read_inputs
 from pipelines.jobs.recordings import Gathered, check_recordings, gather_batches, home_lake, load_batches
 from pipelines.settings import Settings
@@ -35,8 +35,6 @@ def continue_diagnosis(
     report: bool = True,
     say: Say = lambda text: None,
     done: Done | None = None,
-    caller: Caller | None = None,
-    work: Diagnose | None = None,
 ) -> DiagnosisOutcome:
     """Diagnose the machine of an earlier diagnosis on its recordings and new ones, and write into its folder again.
 
@@ -59,7 +57,7 @@ def continue_diagnosis(
     check_recordings(recordings)
     check_folder(out, [out / n for n in FILES], overwrite=True)
     machine, file, text = _machine(out, machine_file, before)
-    caller = caller or DirectCaller()
+    caller = DirectCaller()
     gather = partial(gather_batches, machine, batch_ids=(), say=say)
     gathered: Gathered = caller.map("ingest", gather, [recordings], retries=RETRIES)[0]
     batches, new = joined(before, gathered.batches, load_batches(home_lake(), machine), out, say)
@@ -67,7 +65,7 @@ def continue_diagnosis(
     seed = before.seed if seed is None else seed
     again = DiagnosisRequest(file, out, recordings, (), seed, report, overwrite=True)
     together = Gathered(tuple(batches), gathered.ingested)
-    return finished(again, machine, text, together, settings, say, done, caller, work, continued)
+    return finished(again, machine, text, together, settings, say, done, caller, continued)
 
 
 def joined(

@@ -7,14 +7,13 @@ from __future__ import annotations
 import math
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Protocol
 
 import numpy as np
 
@@ -31,7 +30,7 @@ from models.families import FAMILIES
 from models.protocols import PromotionRule
 from models.selection.promotion import judged, left_out
 from models.selection.result import GridResult
-from pipelines.caller import RETRIES, Caller, DirectCaller, Done, Say
+from pipelines.caller import RETRIES, DirectCaller, Done, Say
 from pipelines.jobs.inputs import INPUTS, Inputs
 from pipelines.jobs.recordings import Gathered, check_recordings, gather_batches
 from pipelines.settings import Settings, home
@@ -43,20 +42,6 @@ from twin.schema import Calibrated
 
 REPORT, PLAN, MACHINE, FINDINGS = "report.html", "next_run.yml", "machine.yml", "findings.json"
 FILES = (REPORT, PLAN, MACHINE, INPUTS, FINDINGS)  # the last one says that the others are complete
-
-
-class Diagnose(Protocol):
-    """The signature of `diagnosis.diagnose.diagnose`, and of a stand-in for it."""
-
-    def __call__(
-        self,
-        machine: Machine,
-        batches: list[Batch],
-        *,
-        seed: int,
-        processes: int,
-        progress: Done | None,
-    ) -> Diagnosis: ...
 
 
 @dataclass(frozen=True)
@@ -106,8 +91,7 @@ def diagnose_file(
     settings: Settings,
     say: Say = lambda text: None,
     done: Done | None = None,
-    caller: Caller | None = None,
-    work: Diagnose | None = None,
+    caller: DirectCaller | None = None,
 ) -> DiagnosisOutcome:
     """Diagnose a machine on recordings, write OUT and track it as a run.
 
@@ -115,7 +99,6 @@ def diagnose_file(
 
     Args:
         caller: how the steps run; as plain calls by default.
-        work: another diagnosis than the library's.
 
     Raises:
         InputError: a file, batch or option that cannot be used.
@@ -125,7 +108,7 @@ def diagnose_file(
     caller = caller or DirectCaller()
     gather = partial(gather_batches, machine, batch_ids=request.batch_ids, say=say)
     gathered: Gathered = caller.map("ingest", gather, [request.recordings], retries=RETRIES)[0]
-    return finished(request, machine, text, gathered, settings, say, done, caller, work)
+    return finished(request, machine, text, gathered, settings, say, done, caller)
 
 
 def finished(
@@ -136,8 +119,7 @@ def finished(
     settings: Settings,
     say: Say,
     done: Done | None,
-    caller: Caller,
-    work: Diagnose | None,
+    caller: DirectCaller,
     continued: Continued | None = None,
 ) -> DiagnosisOutcome:
     """The work on batches that are there: diagnose, write OUT, track.
@@ -148,7 +130,7 @@ def finished(
     """
     batches = list(gathered.batches)
     say(f"diagnose {machine.machine}: {len(batches)} batches")
-    found = caller.map("diagnose", partial(_diagnosed, machine, batches, request.seed, say, done), [work])[0]
+    found = caller.map("diagnose", partial(_diagnosed, machine, batches, request.seed, say), [done])[0]
     say("write")
     inputs = Inputs.of(machine.machine, request.machine_file, text, request.seed, batches)
     files, trouble = write_diagnosis(found, request.out, text, request.report, inputs, continued)
@@ -210,7 +192,8 @@ def write_diagnosis(
         machine_file = new_machine_file(d, text, f"machine file {out / MACHINE}", datetime.now().astimezone())
     except (InputError, WorkError) as error:  # the findings are written all the same
         trouble = str(error)
-    kept = [] if continued is None else [_free_name(out)]
+    numbered = (f"findings.{k}.json" for k in count(1))
+    kept = [] if continued is None else [next(name for name in numbered if not (out / name).exists())]
     with staged(out, [*kept, *FILES]) as scratch:
         for name in kept:
             (scratch / name).write_bytes((out / FINDINGS).read_bytes())
@@ -225,12 +208,6 @@ def write_diagnosis(
             write_diagnosis_report(scratch / REPORT, d, continued=continued)
         names = [name for name in (*reversed(FILES), *kept) if (scratch / name).exists()]
     return {name: out / name for name in names}, trouble
-
-
-def _free_name(out: Path) -> str:
-    """``findings.1.json``, or the next number that is free."""
-    taken = {p.name for p in out.iterdir()}
-    return next(name for k in count(1) if (name := f"findings.{k}.json") not in taken)
 
 
 def new_machine_file(d: Diagnosis, text: str, where: str, when: datetime) -> str | None:
@@ -267,9 +244,7 @@ def _naming_plan(d: Diagnosis) -> Findings:
     return d.findings.model_copy(update={"next_experiment": named})
 
 
-def _diagnosed(
-    machine: Machine, batches: list[Batch], seed: int, say: Say, done: Done | None, work: Diagnose | None
-) -> Diagnosis:
+def _diagnosed(machine: Machine, batches: list[Batch], seed: int, say: Say, done: Done | None) -> Diagnosis:
     last = ""
 
     def progress(step: str, n: int, of: int) -> None:
@@ -280,15 +255,14 @@ def _diagnosed(
             say(step)
             last = step
 
-    work = work or library_diagnosis()
-    d = work(machine, batches, seed=seed, processes=os.cpu_count() or 1, progress=progress)
+    d = library_diagnosis()(machine, batches, seed=seed, processes=os.cpu_count() or 1, progress=progress)
     account = Account.of(batches)
     lost = "".join(account.warning(n) for n in machine.names("error"))
     stated = {"account": account.as_dict(), "statement": lost + d.findings.statement}
     return replace(d, findings=d.findings.model_copy(update=stated))
 
 
-def library_diagnosis() -> Diagnose:
+def library_diagnosis() -> Callable[..., Diagnosis]:
     """The library's diagnosis; imported here because its import takes seconds."""
     from diagnosis.diagnose import diagnose
 
@@ -388,7 +362,6 @@ def diagnose_if_grown(
     ids: Mapping[str, str],
     settings: Settings,
     say: Say = lambda text: None,
-    work: Diagnose | None = None,
 ) -> tuple[DiagnosisOutcome | None, str]:
     """Diagnose on all batches of the lake where the error has grown by more than the settings allow.
 
@@ -405,7 +378,7 @@ def diagnose_if_grown(
         say(f"diagnose: {grown.summary}")
         machine = next(iter(now.values())).machine
         request = DiagnosisRequest(machine_file, dated_folder(machine))
-        outcome = diagnose_file(request, settings, say, work=work)
+        outcome = diagnose_file(request, settings, say)
     except (InputError, WorkError) as error:
         return None, f"not diagnosed: {error}"
     except Exception as error:

@@ -1,6 +1,6 @@
 """The yearly job as one list of steps: ingest → features → grid → track → promote → report, and a diagnosis if need be.
 
-The steps are plain functions; a `pipelines.caller.Caller` decides how they run: here and now, or as tasks of a flow."""
+The steps are plain functions, which `pipelines.caller.DirectCaller` runs: here and now, or as tasks of a flow."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from models.selection.result import GridResult, Training
 from models.selection.trust import Region, left_out_runs
 from models.selection.updating import updated_scores
 from pipelines import stopping
-from pipelines.caller import RETRIES, Caller, Say
+from pipelines.caller import RETRIES, DirectCaller, Say
 from pipelines.jobs.recordings import check_channels, home_lake, load_batches
 from pipelines.jobs.request import TrainRequest, check_request
 from pipelines.settings import Settings, home
@@ -78,7 +78,7 @@ class TrainOutcome:
 def train(
     request: TrainRequest,
     settings: Settings,
-    caller: Caller,
+    caller: DirectCaller,
     say: Say = lambda text: None,
     pools: Pools = local_pools,
 ) -> TrainOutcome:

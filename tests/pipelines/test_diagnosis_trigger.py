@@ -88,7 +88,8 @@ def grown(home: Path, store: Settings, tmp_path: Path, monkeypatch: pytest.Monke
     def run(limit: float | None, toy: Toy) -> Any:
         settings = replace(store, diagnose=DiagnoseRule(when_error_grows_by=limit))
         said: list[str] = []
-        return (*diagnose_if_grown(file, {"z": now}, ids, settings, said.append, toy), said)
+        monkeypatch.setattr(diagnosing, "library_diagnosis", lambda: toy)
+        return (*diagnose_if_grown(file, {"z": now}, ids, settings, said.append), said)
 
     return run
 
