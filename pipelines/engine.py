@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-from functools import partial
 from typing import TYPE_CHECKING
 
 from data.errors import InputError
@@ -13,53 +10,48 @@ from pipelines.jobs.request import TrainRequest
 from pipelines.settings import Settings
 
 if TYPE_CHECKING:
-    from pipelines.dask_pools import Cluster
     from pipelines.jobs.training import TrainOutcome
-    from pipelines.prefect_reports import Reports
 
 ENGINES = ("prefect", "direct", "dask")
 
 
-class Engine:
-    """Made before the work begins, so that what takes time to come up can begin to.
+def train_by(
+    engine: str,
+    request: TrainRequest,
+    settings: Settings,
+    say: Say = lambda text: None,
+    done: Done | None = None,
+    address: str | None = None,
+) -> TrainOutcome:
+    """`pipelines.jobs.training.train` by one of `ENGINES`.
 
     Args:
-        key: direct: plain calls in this process, and worker processes where they pay; prefect: these, reported to the
-            Prefect server that PREFECT_API_URL names, else to a temporary one; dask: reported as well, with the grid on
-            a Dask cluster.
+        engine: direct: plain calls in this process, and worker processes where they pay; prefect: these, reported to
+            the Prefect server that PREFECT_API_URL names, else to a temporary one; dask: reported as well, with the
+            grid on a Dask cluster.
         address: of the cluster's scheduler, such as tcp://host:8786; None starts one on this computer, on 127.0.0.1.
 
     Raises:
         InputError: packages that are not installed, an address that is none, or one without use.
+        WorkError: a cluster that cannot be used.
     """
-
-    def __init__(self, key: str, address: str | None = None) -> None:
-        if address is not None and key != "dask":
-            raise InputError(f"--address: engine {key} takes none; it is of the scheduler of --engine dask")
-        if address is not None and "://" not in address:
-            raise InputError(f"--address: got {address!r}, expected that of a Dask scheduler, such as tcp://host:8786")
-        self._reports: Reports | None = None
-        self._cluster: Callable[[], AbstractContextManager[Cluster]] | None = None
-        if key == "dask":
-            from pipelines.dask_pools import open_cluster
-
-            self._cluster = partial(open_cluster, address, LANES)
-        if key != "direct":
-            from pipelines.prefect_reports import Reports
-
-            self._reports = Reports()
-
-    def train(
-        self, request: TrainRequest, settings: Settings, say: Say = lambda text: None, done: Done | None = None
-    ) -> TrainOutcome:
-        """`pipelines.jobs.training.train`; raises what that raises, and of a cluster that cannot be used WorkError."""
-        from pipelines.flows import train_in_flow
+    if address is not None and engine != "dask":
+        raise InputError(f"--address: engine {engine} takes none; it is of the scheduler of --engine dask")
+    if address is not None and "://" not in address:
+        raise InputError(f"--address: got {address!r}, expected that of a Dask scheduler, such as tcp://host:8786")
+    if engine == "direct":
         from pipelines.jobs.training import train
 
-        if self._reports is None:
-            return train(request, settings, DirectCaller(done), say)
-        if self._cluster is None:
-            return train_in_flow(request, settings, say, done, self._reports)
-        with self._cluster() as cluster:
-            say(f"Dask cluster {cluster.name}: {cluster.n} workers")
-            return train_in_flow(request, settings, say, done, self._reports, cluster.pools, max(LANES, cluster.n))
+        return train(request, settings, DirectCaller(done), say)
+    if engine == "dask":
+        from pipelines.dask_pools import open_cluster
+    from pipelines.prefect_reports import Reports
+
+    reports = Reports()  # comes up while the rest is imported
+    from pipelines.flows import train_in_flow
+
+    if engine == "prefect":
+        return train_in_flow(request, settings, say, done, reports)
+    with open_cluster(address, LANES) as cluster:
+        say(f"Dask cluster {cluster.name}: {cluster.n} workers")
+        return train_in_flow(request, settings, say, done, reports, cluster.pools, max(LANES, cluster.n))

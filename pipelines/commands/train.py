@@ -210,7 +210,7 @@ def train(
     from models.families import FAMILIES
     from models.protocols import PROTOCOLS
     from models.selection.crossing import FINALISTS, Plan
-    from pipelines.engine import ENGINES, Engine
+    from pipelines.engine import ENGINES, train_by
     from pipelines.jobs.request import TrainRequest, check_request
 
     one_of(engine, ENGINES, "--engine")
@@ -229,9 +229,8 @@ def train(
         from pipelines.store.tracking import open_store
 
         open_store(configured)
-    chosen = Engine("direct" if direct else engine, address)
     with console.progress(as_json) as (say, done):
-        outcome = chosen.train(request, configured, say, done)
+        outcome = train_by("direct" if direct else engine, request, configured, say, done, address)
     if as_json:
         console.print_json(training_dict(outcome))
     else:

@@ -18,7 +18,7 @@ from models.selection.crossing import FamilyResult, Plan, prepare
 from models.selection.grid import Workers
 from models.selection.race import rounds
 from pipelines.caller import LANES, DirectCaller
-from pipelines.engine import Engine
+from pipelines.engine import train_by
 from pipelines.jobs.request import TrainRequest
 from pipelines.jobs.training import TrainOutcome, train
 from tests.conftest import make_toy_batches
@@ -26,6 +26,7 @@ from tests.toys.command import in_process
 from tests.toys.postgres import free_port
 from tests.toys.small_year import write_machine, write_year
 
+NOTHING: Any = None  # where the call ends before it is needed
 dask_pools = pytest.importorskip("pipelines.dask_pools", exc_type=InputError)
 PLAN = Plan(("none", "correlation"), ("zero", "ridge", "pls"), ("leave-batch-out", "train-on-one"))
 LONGER = Plan(("none",), ("zero", "ridge", "pls", "random_forest", "huber"), ("leave-batch-out",))
@@ -48,16 +49,16 @@ def test_an_unknown_engine_or_an_address_without_use_is_one_line(
     assert done.code == 2 and "--direct is --engine direct; got --engine dask" in done.err
     for key in ("direct", "prefect"):
         with pytest.raises(InputError, match=f"--address: engine {key} takes none"):
-            Engine(key, "tcp://127.0.0.1:8786")
+            train_by(key, NOTHING, NOTHING, address="tcp://127.0.0.1:8786")
     with pytest.raises(InputError, match="--address: got 'host:8786', expected that of a Dask scheduler"):
-        Engine("dask", "host:8786")
+        train_by("dask", NOTHING, NOTHING, address="host:8786")
 
 
 def test_a_missing_package_names_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     monkeypatch.delitem(sys.modules, "pipelines.dask_pools")
     with pytest.raises(InputError, match=r"engine dask: .*run pip install 'thermodrift\[dask\]'"):
-        Engine("dask")
+        train_by("dask", NOTHING, NOTHING)
 
 
 def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,7 +134,7 @@ def test_a_training_on_three_workers_one_of_which_ends(
                 os.kill(ended[0], signal.SIGKILL)
 
         far = train(request(tmp_path, "engine-dask"), store, DirectCaller(done), pools=three.pools)
-    near = Engine("direct").train(request(tmp_path, "engine-direct"), store)
+    near = train_by("direct", request(tmp_path, "engine-direct"), store)
     assert len(ended) == 1
     assert_same_training(far, near, "engine-dask", "engine-direct")
     assert "distributed" not in "".join(capfd.readouterr())
@@ -145,8 +146,8 @@ def test_the_engine_as_prefect_runs_it(
 ) -> None:
     monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
     said: list[str] = []
-    far = Engine("dask").train(request(tmp_path, "engine-flow"), store, said.append)
-    near = Engine("direct").train(request(tmp_path, "engine-plain"), store)
+    far = train_by("dask", request(tmp_path, "engine-flow"), store, said.append)
+    near = train_by("direct", request(tmp_path, "engine-plain"), store)
     assert f"Dask cluster 127.0.0.1: {LANES} workers" in said
     assert_same_training(far, near, "engine-flow", "engine-plain")
 
