@@ -35,14 +35,6 @@ COLUMNS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Clock:
-    """The time, s since 1970, and waiting."""
-
-    now: Callable[[], float] = time.time
-    wait: Callable[[float], None] = time.sleep
-
-
 @dataclass
 class Ingested:
     """One batch of one file, or one file without a usable batch (`batch_id` "").
@@ -114,7 +106,6 @@ def ingest(
     machine: Machine,
     lake: Lake,
     progress: Callable[[str], None] | None = None,
-    clock: Clock | None = None,
 ) -> IngestReport:
     """Bring files and directories into the lake, in memory bounded by one batch.
 
@@ -130,7 +121,7 @@ def ingest(
     """
     check_canonical({n: (c.role, c.unit) for n, c in machine.channels.items()}, f"machine file {machine.machine}")
     files, ignored = _collect(paths, machine)
-    growing = _growing(files, clock or Clock())
+    growing = _growing(files)
     run = _Run(machine, lake, IngestReport(machine.machine, ignored=ignored))
     for number, (file, folder) in enumerate(files.items(), 1):
         if progress:
@@ -152,11 +143,11 @@ def _look(file: Path) -> tuple[int, int] | None:
     return seen.st_size, seen.st_mtime_ns
 
 
-def _growing(files: Iterable[Path], clock: Clock) -> set[Path]:
+def _growing(files: Iterable[Path]) -> set[Path]:
     """Files that were changed lately and change again between two looks."""
-    seen = {f: look for f in files if (look := _look(f)) and clock.now() - look[1] / 1e9 < RECENT_S}
+    seen = {f: look for f in files if (look := _look(f)) and time.time() - look[1] / 1e9 < RECENT_S}
     if seen:
-        clock.wait(LOOK_AGAIN_S)
+        time.sleep(LOOK_AGAIN_S)
     return {f for f, look in seen.items() if _look(f) != look}
 
 

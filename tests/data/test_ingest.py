@@ -1,8 +1,10 @@
 """Ingest with readers and checks replaced by plain ones, then once through the real door."""
 
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -11,7 +13,7 @@ import pytest
 import data.ingest
 from data.batch import Batch, Channel, Finding
 from data.errors import InputError, WorkError
-from data.ingest import COLUMNS, Clock, IngestReport, ingest
+from data.ingest import COLUMNS, IngestReport, ingest
 from data.lake import Lake
 from data.machine import Machine, Overrule, parse_machine
 
@@ -299,7 +301,7 @@ def test_a_damaged_file_of_the_lake_is_healed_by_its_source(tmp_path: Path, lake
     assert statuses(ingest(files, MACHINE, lake)) == [("a", "unchanged"), ("b", "unchanged")]
 
 
-def test_a_growing_file_waits(tmp_path: Path, lake: Lake) -> None:
+def test_a_growing_file_waits(tmp_path: Path, lake: Lake, monkeypatch: pytest.MonkeyPatch) -> None:
     still, growing = write(tmp_path / "a.csv", "a,1,3,0"), write(tmp_path / "b.csv", "b,2,3,0")
     waits: list[float] = []
 
@@ -309,11 +311,14 @@ def test_a_growing_file_waits(tmp_path: Path, lake: Lake) -> None:
             file.write("c,3,3,0\n")
 
     now = growing.stat().st_mtime
-    report = ingest([still, growing], MACHINE, lake, clock=Clock(lambda: now + 1, wait))
+    clock = SimpleNamespace(time=lambda: now + 1, sleep=wait, monotonic=time.monotonic)
+    monkeypatch.setattr(data.ingest, "time", clock)
+    report = ingest([still, growing], MACHINE, lake)
     assert statuses(report) == [("a", "new"), ("", "waiting")] and len(waits) == 1
     assert report.waiting[0].reason == f"{growing}: still being written; ingest it again when it is complete"
     assert not lake.quarantined("vmc")
-    report = ingest([still, growing], MACHINE, lake, clock=Clock(lambda: now + 60, wait))
+    clock.time = lambda: now + 60
+    report = ingest([still, growing], MACHINE, lake)
     assert statuses(report) == [("a", "unchanged"), ("b", "new"), ("c", "new")] and len(waits) == 1
 
 
