@@ -144,7 +144,11 @@ class Compensator:
         self.guard = Guard(substitutes) if substitutes is not None else None
         self._watch = self.guard.begin() if self.guard is not None else None
         self._steps = {a.axis: (a.program.runner(), a.watched.runner(), a.region.row()) for a in axes}
-        self._inputs = {a.axis: _inputs_of(a) for a in axes}
+        # places of the inputs among the watched quantities, and what each is divided by
+        self._inputs = {
+            a.axis: ([list(a.region.ranges).index(i) for i in a.inputs], np.array([scale_of(u) for u in a.units]))
+            for a in axes
+        }
         self._wanted = tuple(dict.fromkeys(c for a in axes for c in a.program.channels))
         self._run = {a.axis: self._fresh(a) for a in axes}
         self.stopped = False  # by the operator
@@ -295,7 +299,7 @@ class Compensator:
             self.begin_run()
         if self._grid_s is None:
             self._held = clean
-            if missing := self._missing(clean):
+            if missing := [c for c in self._wanted if c not in clean]:
                 return f"not yet seen: {', '.join(missing)}", notes
             self._rows(time_s, [clean])
             return None, notes
@@ -307,9 +311,6 @@ class Compensator:
             self._held = whole
             self._rows(self._grid_s + rows * self.period_s, between)
         return None, notes
-
-    def _missing(self, values: Mapping[str, float]) -> list[str]:
-        return [c for c in self._wanted if c not in values]
 
     def _lost(self, time_s: float) -> list[str]:
         return [c for c in self._wanted if time_s - self._arrived_s.get(c, time_s) > self._patience_s]
@@ -456,12 +457,6 @@ class Compensator:
         grid_s, shift_s = plain["grid_s"], float(plain["shift_s"])
         self._clock = SampleClock(None if grid_s is None else grid_s + shift_s, shift_s)
         self._run, self._held, self._watch, self._grid_s = runs, held, watch, grid_s
-
-
-def _inputs_of(a: AxisModel) -> tuple[list[int], Array]:
-    """Places of the inputs among the watched quantities, and what each is divided by."""
-    names = list(a.region.ranges)
-    return [names.index(i) for i in a.inputs], np.array([scale_of(u) for u in a.units])
 
 
 def _row(program: Program, values: Mapping[str, float]) -> Array:

@@ -85,12 +85,10 @@ class Group:
         """Channel name -> place of its column, for every column that holds a number in any table."""
         names: dict[str, int] = {}
         for i in sorted({i for _, table in self.tables for i in table.numeric}):
-            name = self._slug(i)[: MAX_NAME // 2]
+            slug = re.sub(r"[^\w]+", "_", plain(guess.without_unit(self.table.title(i)))).strip("_")
+            name = (slug or f"column_{i}")[: MAX_NAME // 2]
             names[name if name not in names and name not in TAKEN else f"{name}_{i}"] = i
         return names
-
-    def _slug(self, i: int) -> str:
-        return re.sub(r"[^\w]+", "_", plain(guess.without_unit(self.table.title(i)))).strip("_") or f"column_{i}"
 
     @cached_property
     def rows(self) -> list[Rows]:

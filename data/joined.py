@@ -103,12 +103,14 @@ def read_joined(machine: Machine, key: str, place: Place, time_s: tuple[float, f
     if len(found) > 1:
         where, rows = f"{part.file or place.path.name}", join([r for _, _, r, _ in found])
     if part.time.unit == machine.recording.time.unit == "timestamp":
-        rows = _during(rows, time_s, machine.recording.max_gap_s)
-        if not len(rows):
+        more_s = machine.recording.max_gap_s
+        inside = np.flatnonzero((rows.time_s >= time_s[0] - more_s) & (rows.time_s <= time_s[1] + more_s))
+        if not len(inside):
             raise InputError(
                 f"{place.path.name}: {where} has no row at the recording's times; correct recording.joined.{key}, or "
                 "add the missing recording"
             )
+        rows = rows.part(int(inside[0]), int(inside[-1]) + 1)
     return JoinedRows(rows, described, where, layout.sweeps)
 
 
@@ -143,8 +145,3 @@ def _tables(
             except NotThisTable:
                 continue  # other content, as in the recording itself
             yield where, sheet, layout
-
-
-def _during(rows: Rows, time_s: tuple[float, float], more_s: float) -> Rows:
-    inside = np.flatnonzero((rows.time_s >= time_s[0] - more_s) & (rows.time_s <= time_s[1] + more_s))
-    return rows.part(int(inside[0]), int(inside[-1]) + 1) if len(inside) else rows.part(0, 0)

@@ -432,7 +432,8 @@ def _batch(rows: Rows, source: _Source, extra: dict[str, int], file_start: float
     n_rows = len(found["time_s"])
     for samples, later_s in others:
         columns, counts = samples.on_grid(origin_s - later_s)
-        found |= {n: _of_length(v, n_rows) for n, v in columns.items() if n != "time_s"}
+        missing = np.full(max(0, n_rows - len(columns.pop("time_s"))), np.nan)
+        found |= {n: np.concatenate([v[:n_rows], missing]) for n, v in columns.items()}
         repairs["joined_rows"] = repairs.get("joined_rows", 0) + counts["rows_in"]
         repairs["unparsable_values"] += counts["unparsable_values"]
     repairs |= extra
@@ -479,11 +480,6 @@ def _others(main: _Samples, source: _Source) -> tuple[list[tuple[_Samples, float
         together = stamped != (part.time.unit == "timestamp")
         found.append((samples, 0.0 if together else samples.start - main.start))
     return found, skipped
-
-
-def _of_length(column: Array, n_rows: int) -> Array:
-    """The column cut to that length, or with NaN behind it."""
-    return np.concatenate([column[:n_rows], np.full(max(0, n_rows - len(column)), np.nan)])
 
 
 def _in_canonical_units(found: Mapping[str, Array], machine: Machine, passed_over: bool) -> dict[str, Array]:

@@ -124,13 +124,8 @@ def progress(quiet: bool) -> Iterator[tuple[Say, Done]]:
 
 
 def print_json(value: Any) -> None:
-    """Strict JSON, see `json_text`."""
-    sys.stdout.write(json_text(value))
-
-
-def json_text(value: Any) -> str:
     """Strict JSON: a number that is not finite is null."""
-    return json.dumps(_finite(value), indent=1, default=str, allow_nan=False) + "\n"
+    sys.stdout.write(json.dumps(_finite(value), indent=1, default=str, allow_nan=False) + "\n")
 
 
 def records(frame: pd.DataFrame) -> list[dict[str, Any]]:

@@ -98,7 +98,9 @@ def _shared(batches: Sequence[Batch]) -> dict[Habit, str]:
     """Habits that most batches have in common, or that come and go over the year as no fault does; and how often."""
     where: dict[Habit, list[int]] = {}
     in_part: set[Habit] = set()
-    batches = [batches[i] for i in _in_order(batches)]
+    starts = [b.start for b in batches if b.start is not None]
+    if len(starts) == len(batches):  # else in the order given
+        batches = [batches[i] for i in sorted(range(len(batches)), key=starts.__getitem__)]
     masked = [{f.channel for f in b.findings if f.masks} for b in batches]
     for k, batch in enumerate(batches):
         habits = [(f, (f.channel, habit)) for f in batch.findings if (habit := _habit(batch, f))]
@@ -114,12 +116,6 @@ def _shared(batches: Sequence[Batch]) -> dict[Habit, str]:
         elif key not in in_part and periods >= _PERIODS:
             out[key] = f"{len(at)} of {len(batches)} runs, in {periods} separate periods"
     return out
-
-
-def _in_order(batches: Sequence[Batch]) -> list[int]:
-    """Positions by start; as given where a start is not known."""
-    known = [b.start for b in batches if b.start is not None]
-    return sorted(range(len(batches)), key=known.__getitem__) if len(known) == len(batches) else [*range(len(batches))]
 
 
 def _habit(batch: Batch, f: Finding) -> str:

@@ -114,7 +114,7 @@ class Swapped(Check):
         if len(batches) < _BATCHES:
             return found
         for roles, least, prints_of, least_spread in (
-            (THERMAL, 3, _fingerprints, _of_temperatures), (("driver",), 2, _levels, _of_levels),
+            (THERMAL, 3, _fingerprints, lambda centre: np.array(_LEAST_SPREAD)), (("driver",), 2, _levels, _of_levels),
         ):  # fmt: skip
             names = list(batches[0].names(*roles))
             if len(names) < least:
@@ -157,10 +157,6 @@ def _of_levels(centre: Array) -> Array:
     return np.asarray(0.05 * np.maximum(np.ptp(centre, axis=1), np.abs(centre).max(axis=1) * 0.1)[:, None] + 1e-12)
 
 
-def _of_temperatures(centre: Array) -> Array:
-    return np.array(_LEAST_SPREAD)
-
-
 def _fingerprints(batch: Batch, names: list[str]) -> Array:
     """Start level, K, and rises at the stated times as shares of the batch's typical largest rise: (p, 1 + times)."""
     out = np.full((len(names), 1 + len(_AT)), np.nan)
@@ -201,7 +197,10 @@ class Unexplained(Check):
     def across(self, batches: Sequence[Batch], machine: Machine) -> dict[int, list[Finding]]:
         if len(batches) < _BATCHES_TO_COMPARE:
             return {}
-        names = [n for n in batches[0].names(*THERMAL) if all(_sound(b, n) for b in batches)]
+        names = [
+            n for n in batches[0].names(*THERMAL)
+            if all(n in b.channels and np.isfinite(b.masked(n)).mean() > 0.8 for b in batches)
+        ]  # fmt: skip
         if len(names) < 2:
             return {}
         x = [np.column_stack([b.masked(n) for n in names]) for b in batches]
@@ -257,10 +256,6 @@ class _Sums:
                 w = np.linalg.solve(self.grams[train].sum(axis=0) + ridge, self.cross[train].sum(axis=0))
                 out[k] = float(np.sqrt(np.mean((y - a @ w) ** 2)))
         return out
-
-
-def _sound(batch: Batch, name: str) -> bool:
-    return name in batch.channels and bool(np.isfinite(batch.masked(name)).mean() > 0.8)
 
 
 _HASHED_ROWS = 16  # rows that are compared as one; noise does not repeat over so many

@@ -86,8 +86,7 @@ def cell_texts(column: Any, which: NDArray[np.bool_]) -> NDArray[Any]:
 
 def _numpy(column: Any) -> Array:
     """Float64 copy with nulls as NaN."""
-    values = column.to_numpy(zero_copy_only=False) if isinstance(column, pa.Array) else column.to_numpy()
-    return np.asarray(values, dtype=np.float64)
+    return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.float64)
 
 
 def _text_to_float(column: Any, decimal: str, unit: str) -> tuple[Array, NDArray[np.bool_] | None]:
@@ -98,7 +97,7 @@ def _text_to_float(column: Any, decimal: str, unit: str) -> tuple[Array, NDArray
     if decimal != ".":
         numbers = pc.replace_substring(numbers, decimal, ".")
     values = _numpy(numbers.cast(pa.float64())).copy()
-    rest = np.flatnonzero(~np.asarray(plain.to_numpy(**_copying(plain)), bool))
+    rest = np.flatnonzero(~np.asarray(plain.to_numpy(zero_copy_only=False), bool))
     bad = np.isinf(values)  # 1e999
     values[bad] = np.nan
     if len(rest):
@@ -107,10 +106,6 @@ def _text_to_float(column: Any, decimal: str, unit: str) -> tuple[Array, NDArray
         values[rest] = [np.nan if read[c] is None else read[c] for c in cells]
         bad[rest] = [read[c] is None and c not in MISSING for c in cells]
     return values, bad if bad.any() else None
-
-
-def _copying(column: Any) -> dict[str, bool]:
-    return {"zero_copy_only": False} if isinstance(column, pa.Array) else {}
 
 
 _NUMBER = re.compile(r"([+-]?)\s*(\d[\d.,]*|[.,]\d+)([eE][+-]?\d+)?", re.ASCII)

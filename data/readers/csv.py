@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pyarrow as pa
 import pyarrow.csv as pc
@@ -61,21 +61,16 @@ def find_encoding(raw: bytes, where: str) -> str:
     if (first := raw.find(b"\0")) >= 0:
         at = f"{raw.count(bytes(1))} NUL bytes from line {raw.count(10, 0, first) + 1} on, as a crash leaves them"
         raise InputError(f"{where}: {at}; expected CSV text; remove them or export the recording again")
-    if _decodes(raw, "utf-8"):
+    try:
+        codecs.getincrementaldecoder("utf-8")("strict").decode(raw, False)  # the last character may be cut
         return "utf-8"
+    except UnicodeDecodeError:
+        pass
     foreign = b"\n".join(line for line in raw.splitlines() if not line.isascii())
     if {c for c in foreign.decode("cp1252", "replace") if ord(c) > 127} <= _EUROPEAN:
         return "cp1252"  # a few letters are too little to tell
     best = from_bytes(foreign[:10_000], cp_isolation=_OTHER_ENCODINGS).best()
     return best.encoding if best is not None else "cp1252"
-
-
-def _decodes(raw: bytes, encoding: str) -> bool:
-    try:
-        codecs.getincrementaldecoder(encoding)("strict").decode(raw, False)
-    except UnicodeDecodeError:
-        return False
-    return True
 
 
 def find_separator(lines: Sequence[str], hints: Sequence[str], separators: Sequence[str] = SEPARATORS) -> str:
@@ -307,9 +302,11 @@ class CsvSheet(Sheet):
 class CsvReader(Reader):
     """Comma, semicolon, tab, bar or blanks; UTF-8, UTF-16, GB18030, Shift-JIS, CP1252; decimal point or comma."""
 
+    sheet: ClassVar[type[CsvSheet]] = CsvSheet
+
     @contextmanager
     def open(self, path: Path, hints: Sequence[str]) -> Iterator[list[Sheet]]:
-        yield [CsvSheet(path, hints, self.form)]
+        yield [self.sheet(path, hints, self.form)]
 
 
 def read_text_table(path: Path) -> list[dict[str, str]]:

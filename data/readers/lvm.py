@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
 
 from data.machine import Form
-from data.readers.base import Reader, Sheet
 from data.readers.cells import parse_number
-from data.readers.csv import CsvSheet
+from data.readers.csv import CsvReader, CsvSheet
 
 _END = "***End_of_Header***"
 _LABVIEW_S = -2_082_844_800.0  # 1904-01-01 in s since 1970
@@ -41,9 +39,7 @@ class LvmSheet(CsvSheet):
             self.origin_s = 0.0 if pd.isna(stamp) else stamp.timestamp()
 
 
-class LvmReader(Reader):
+class LvmReader(CsvReader):
     """Text that LabVIEW writes, with one header or several."""
 
-    @contextmanager
-    def open(self, path: Path, hints: Sequence[str]) -> Iterator[list[Sheet]]:
-        yield [LvmSheet(path, hints, self.form)]
+    sheet = LvmSheet

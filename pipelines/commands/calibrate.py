@@ -66,10 +66,13 @@ def write_calibrated(found: Calibration, text: str, machine_file: Path, out: Pat
     from twin.compile import compile_network
     from twin.schema import Calibrated
 
+    remarks = [found.fit.message, *found.remarks]
+    if found.left_out is not None:
+        remarks.append(f"left_out_rms: mean over {found.left_out.summary}")
     when = datetime.now().astimezone().isoformat(timespec="seconds")
     origin = Calibrated(
         batches=found.batches, when=when, simulated=found.simulated, left_out_rms=_left_out_rms(found),
-        words=_remarks(found),
+        words="; ".join(remarks),
     )  # fmt: skip
     network = compile_network(found.machine, f"machine file {machine_file}")
     new = calibrated_text(text, network, found.values, found.intervals90, origin, f"machine file {out}")
@@ -84,13 +87,6 @@ def _left_out_rms(found: Calibration) -> dict[str, float]:
     table = found.left_out.by_channel()
     units = dict(zip(table["channel"], table["unit"], strict=True))
     return {f"{channel}_{units[channel]}": rms for channel, rms in found.left_out.rms.items()}
-
-
-def _remarks(found: Calibration) -> str:
-    parts = [found.fit.message, *found.remarks]
-    if found.left_out is not None:
-        parts.append(f"left_out_rms: mean over {found.left_out.summary}")
-    return "; ".join(parts)
 
 
 def calibration_dict(outcome: CalibrationOutcome) -> dict[str, Any]:

@@ -104,7 +104,6 @@ def simulate_plans(request: SimulationRequest, say: Say, done: Done) -> Simulati
     from reports.twin.figures import overview_png
     from reports.twin.iso230_3 import write_iso_report
     from reports.twin.page import TwinData, write_twin_report
-    from twin.views.heat_flows import heat_flows
 
     machine = load_machine(request.machine_file)
     network, jobs = jobs_of(request, machine)
@@ -122,7 +121,7 @@ def simulate_plans(request: SimulationRequest, say: Say, done: Done) -> Simulati
     _write(picture, overview_png([(s.job.file.stem, s.batch) for s in out]))
     say("heat flows and modes")
     described = describe_twin(request.machine_file)
-    flows = [heat_flows(one.simulation, one.inputs) for one in out]
+    flows = [one.heat_flows() for one in out]
     data = TwinData(described.view, network.parameters, described.origin, flows=flows, modes=described.modes)
     write_twin_report(page, data, len(flows))
     return SimulationOutcome(machine.machine, tuple(out), picture, page)

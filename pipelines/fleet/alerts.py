@@ -218,7 +218,10 @@ def fleet_view(home: Path, channels: Sequence[Mapping[str, Any]], now: datetime 
             texts, broken = [a.reason for a in shown], [a.rule for a in shown]
             more = {"alerts": texts, "rules": broken, "machine_alerts": len(whole)}
             rows.append(_row(state, plan, run, now) | more)
-    rows.sort(key=_worst_first)
+    # alerts, then no champion, then by drift; a machine's channels without an alert stay with the healthy ones
+    rows.sort(
+        key=lambda r: (-len(r["alerts"]), r["version"] is not None, -(r["drift"] or 0.0), r["machine"], r["channel"])
+    )
     order = {r["machine"]: k for k, r in reversed(list(enumerate(rows)))}
     alerts.sort(key=lambda a: order[a.machine])
     return FleetView(rows, alerts, fleets)
@@ -255,9 +258,3 @@ def _untrained(machine: str) -> Mapping[str, Any]:
     return {**texts, "machine": machine, "version": None, "provisional": None, "simulated": False,
             "expected_S_um": None, "bound90_S_um": None, "n_seen": 0, "runs": [], "sensors": [],
             "unknown": "nothing ingested"}  # fmt: skip
-
-
-def _worst_first(row: Row) -> tuple[Any, ...]:
-    """Alerts, then no champion, then by drift; a machine's channels without an alert stay with the healthy ones."""
-    troubles = len(row["alerts"])
-    return -troubles, row["version"] is not None, -(row["drift"] or 0.0), row["machine"], row["channel"]

@@ -35,11 +35,6 @@ def file_name(machine: str) -> str:
     return quote(machine, safe=" ")
 
 
-def lock_file(home: Path, key: str) -> Path:
-    """The file that is locked while a process serves the fleet."""
-    return folder_of(home) / f"{key}.lock"
-
-
 def read(home: Path, machine: str, what: str) -> dict[str, Any]:
     """MACHINE.`what`.json; empty where there is none, or none that can be read."""
     return read_file(home / "fleet" / f"{file_name(machine)}.{what}.json")

@@ -63,7 +63,7 @@ def alone(home: Path, fleet: Fleet) -> Iterator[None]:
         InputError: another process serves this fleet.
     """
     try:
-        held = FileLock(fleet_state.lock_file(home, fleet.key), timeout=0).acquire()
+        held = FileLock(fleet_state.folder_of(home) / f"{fleet.key}.lock", timeout=0).acquire()
     except Timeout:
         raise InputError(
             f"{fleet.source}: another `thermodrift schedule` serves it with home {home}; end that one first"

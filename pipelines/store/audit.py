@@ -23,7 +23,6 @@ import os
 import platform
 import re
 import uuid
-from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, time, timedelta
 from typing import TYPE_CHECKING, Literal
@@ -86,11 +85,6 @@ class Reign:
     @property
     def since(self) -> datetime:
         return self.entry.when
-
-    def meets(self, span: Span) -> bool:
-        """Whether the version was champion at a point, or during a part of a day."""
-        started = self.since <= span.start or self.since < span.end
-        return started and (self.until is None or span.start < self.until)
 
 
 @dataclass(frozen=True)
@@ -155,7 +149,8 @@ class Log:
 
     def champions(self, span: Span) -> list[Reign]:
         """Who was champion at a point in time, or in the course of a day."""
-        return [r for r in self.reigns if r.meets(span)]
+        begun = [r for r in self.reigns if r.since <= span.start or r.since < span.end]
+        return [r for r in begun if r.until is None or span.start < r.until]
 
     def silence(self) -> str:
         """Why there is no champion at a time that no reign covers."""
@@ -279,11 +274,6 @@ def stamp(when: datetime) -> str:
 def now() -> datetime:
     """The time now, UTC."""
     return datetime.now(UTC)
-
-
-def latest_ends(reigns: Sequence[Reign], champion: int | None) -> dict[int, datetime]:
-    """When each version that is not champion ceased to be, for the last time."""
-    return {r.version: r.until for r in reigns if r.until is not None and r.version != champion}
 
 
 def _parsed(at: When) -> date | datetime:

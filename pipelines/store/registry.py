@@ -393,7 +393,7 @@ def status(settings: Settings, history: bool = True) -> pd.DataFrame:
         for model in registered_models(client):
             versions = every.get(model.name, []) if history else standing_versions(client, model)
             log = audit.read(model)
-            ends = audit.latest_ends(log.reigns, log.champion)
+            ends = {r.version: r.until for r in log.reigns if r.until and r.version != log.champion}
             for v in versions:
                 tags, until = v.tags, ends.get(int(v.version))
                 aliases = sorted(a for a, number in model.aliases.items() if str(number) == str(v.version))

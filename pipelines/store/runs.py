@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
@@ -103,7 +103,8 @@ def write_record(client: MlflowClient, settings: Settings, record: Record, files
     A run is finished last: before, no list of this program has it.
     """
     experiment = experiment_id(client, settings, record.machine, record.target, record.simulated)
-    for run in _runs_of(client, experiment, record.id):
+    # parent and children of every attempt, the newest first
+    for run in client.search_runs([experiment], f"tags.record = '{record.id}'", max_results=1000):
         if run.info.status == "FINISHED" and PARENT not in run.data.tags:
             return str(run.info.run_id)
         if run.info.status == "RUNNING":
@@ -335,11 +336,6 @@ def _all(search: Callable[..., Any], *args: Any, **more: Any) -> Iterator[Any]:
             return
 
 
-def _runs_of(client: MlflowClient, experiment: str, record_id: str) -> list[Run]:
-    """Parent and children, of every attempt; the newest first."""
-    return list(client.search_runs([experiment], f"tags.record = '{record_id}'", max_results=1000))
-
-
 def _interrupt(client: MlflowClient, run: Run, why: str) -> None:
     client.log_batch(run.info.run_id, tags=[RunTag("interrupted", why)])
     client.set_terminated(run.info.run_id, RunStatus.to_string(RunStatus.KILLED))
@@ -373,8 +369,3 @@ def _command() -> str:
     called, *rest = sys.argv or [""]
     own = Path(called).stem == _PROGRAM and rest and not rest[0].startswith("-")
     return f"{_PROGRAM} {rest[0]}" if own else _PROGRAM
-
-
-def tag_run(client: MlflowClient, run_id: str, tags: Mapping[str, str]) -> None:
-    """Set tags of a run in one call."""
-    client.log_batch(run_id, tags=[RunTag(k, v) for k, v in tags.items()])

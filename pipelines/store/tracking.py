@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import mlflow
 import numpy as np
 import pandas as pd
-from mlflow.entities import Run
+from mlflow.entities import Run, RunTag
 from mlflow.exceptions import MlflowException
 from mlflow.tracking import MlflowClient
 from requests import RequestException
@@ -45,6 +45,7 @@ from pipelines.store.audit import CHAMPION
 from pipelines.store.database import StoreOutage
 from pipelines.store.runs import (
     DIAGNOSIS,
+    DatasetRecord,
     Entity,
     Record,
     close_interrupted,
@@ -52,7 +53,6 @@ from pipelines.store.runs import (
     finished_runs,
     now_ms,
     started,
-    tag_run,
     write_record,
     yes_or_no,
 )
@@ -287,7 +287,7 @@ def record_promotion(client: MlflowClient, training_id: str, promotion: dict[str
         "promotion": json.dumps(promotion, ensure_ascii=False), "outcome": str(promotion["outcome"]),
         "model": f"{promotion['name']} version {promotion['version']}",
     }  # fmt: skip
-    tag_run(client, training_id, tags)
+    client.log_batch(training_id, tags=[RunTag(k, v) for k, v in tags.items()])
 
 
 def attach(training_id: str, path: Path, settings: Settings) -> None:
@@ -383,6 +383,7 @@ DIAGNOSIS_COLUMNS = (
     "simulated",
 )
 _VERSIONS = ("thermodrift", "numpy", "scipy", "pandas", "mlflow")
+_NO_NAME = re.compile(r"[^\w\-. /:]")  # characters that the store does not take in the name of a metric
 _MAX_CHARACTERS = 5000  # characters of a parameter or tag; the store takes 6000
 
 
@@ -394,12 +395,18 @@ def diagnosis_record(d: Diagnosis, batches: Sequence[Batch], params: Mapping[str
     mechanism, where, simulated, drafted. The batches are dataset inputs.
     """
     f, now = d.findings, now_ms()
+    versions = {f"version.{name}": version(name) for name in _VERSIONS} | {"version.python": platform.python_version()}
+    known = {"machine": f.machine, "batches": ", ".join(f.batches), **versions, **(params or {})}
     metrics = tuple((k, v, 0) for k, v in _diagnosis_metrics(d).items() if math.isfinite(v))
     return Record(
         id=uuid.uuid4().hex, kind="diagnosis", machine=f.machine, target=DIAGNOSIS, simulated=d.simulated,
         name=f"{pd.Timestamp.now():%Y-%m-%d %H:%M} {f.verdict.replace('_', ' ')}", tags=_short(_diagnosis_tags(d)),
-        params=_short({k: str(v) for k, v in {**_diagnosis_params(d), **(params or {})}.items()}), metrics=metrics,
-        started_ms=now - int(1000 * (f.seconds or 0.0)), ended_ms=now, datasets=dataset_records(_batch_table(batches)),
+        params=_short({k: str(v) for k, v in known.items()}), metrics=metrics,
+        started_ms=now - int(1000 * (f.seconds or 0.0)), ended_ms=now,
+        datasets=tuple(
+            DatasetRecord(name=b.batch_id, digest=b.digest, source=b.source, version=b.version, n_rows=b.n_rows)
+            for b in batches
+        ),
     )  # fmt: skip
 
 
@@ -421,7 +428,7 @@ def _diagnosis_metrics(d: Diagnosis) -> dict[str, float]:
     rms = f.fit.left_out_rms
     groups = {"left_out_rms_before": rms.before, "left_out_rms_after": rms.after, "noise_floor": rms.noise_floor}
     values: dict[str, float] = {
-        f"{group}/{_metric_name(key)}": value
+        f"{group}/{_NO_NAME.sub('_', key)}": value
         for group, by_channel in groups.items()
         for key, value in by_channel.items()
         if value is not None
@@ -435,12 +442,6 @@ def _diagnosis_metrics(d: Diagnosis) -> dict[str, float]:
     return {k: float(v) for k, v in values.items()}
 
 
-def _diagnosis_params(d: Diagnosis) -> dict[str, Any]:
-    versions = {f"version.{name}": version(name) for name in _VERSIONS}
-    batches = {"machine": d.findings.machine, "batches": ", ".join(d.findings.batches)}
-    return {**batches, "version.python": platform.python_version(), **versions}
-
-
 def _diagnosis_tags(d: Diagnosis) -> dict[str, str]:
     first = d.findings.findings[0] if d.findings.findings else None
     return {
@@ -449,16 +450,6 @@ def _diagnosis_tags(d: Diagnosis) -> dict[str, str]:
         "where": f"{first.where.kind} {first.where.name}" if first else "",
         "drafted": yes_or_no(d.drafted),
     }
-
-
-def _batch_table(batches: Sequence[Batch]) -> pd.DataFrame:
-    rows = [(b.batch_id, b.digest, b.version, b.source, b.n_rows) for b in batches]
-    return pd.DataFrame(rows, columns=["batch_id", "digest", "version", "source", "n_rows"])
-
-
-def _metric_name(key: str) -> str:
-    """A name with only characters that the store takes."""
-    return re.sub(r"[^\w\-. /:]", "_", key)
 
 
 def _diagnosis_row(run: Run) -> dict[str, Any]:
