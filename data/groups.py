@@ -32,6 +32,7 @@ FILL_IN = "? s"  # in place of the step of a recording without a clock
 _MAX_TABLES = 20
 _MAX_ROWS = 200_000
 _NAME_DATES = ("%Y%m%d", "%Y-%m-%d", "%Y_%m_%d", "%Y%m%d_%H%M%S", "%Y-%m-%d_%H%M%S", "%Y%m%d-%H%M%S", "%Y%m%d%H%M%S")
+_common = os.path.commonprefix  # of names, character by character
 _ANY = ChannelPart(role="temperature", unit="1")  # no range and no physical limits are known yet
 
 
@@ -345,14 +346,6 @@ def _runs(paths: Sequence[Path], others: Sequence[Path]) -> tuple[str, list[str]
         after = _common([s[len(before) :][::-1] for s in stems])[::-1].lstrip("0123456789")
         runs = sorted(s[len(before) : len(s) - len(after)] for s in stems)
     return f"{before}*{after}{paths[0].suffix}", runs
-
-
-def _common(texts: Sequence[str]) -> str:
-    """What all texts begin with."""
-    same = 0
-    while len({t[: same + 1] for t in texts}) == 1 and same < len(texts[0]):
-        same += 1
-    return texts[0][:same]
 
 
 def _overlap(main: Group, other: Group) -> bool:

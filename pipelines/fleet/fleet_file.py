@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -214,11 +214,12 @@ def load_fleet(path: Path, timezone: str) -> Fleet:
     Raises:
         InputError: not readable, an unknown key, a wrong value, or a machine file given twice.
     """
-    where = f"fleet file {path}"
     parsed = load_yaml(path, _File, "fleet file", every=True)
     machines = tuple(_machine(part, parsed.defaults, path.resolve().parent) for part in parsed.machines)
-    for k, name in _repeated(m.file for m in machines):
-        raise InputError(f"{where}: key 'machines.{k}.machine': {name} is there twice; give each machine one entry")
+    files = [m.file for m in machines]
+    if twice := next((k for k, file in enumerate(files) if file in files[:k]), None):
+        where = f"fleet file {path}: key 'machines.{twice}.machine'"
+        raise InputError(f"{where}: {files[twice]} is there twice; give each machine one entry")
     return Fleet(str(path.resolve()), machines, parsed.at_once, parsed.timezone or timezone, parsed.alerts)
 
 
@@ -245,14 +246,6 @@ def _machine(part: _MachinePart, defaults: _Training, folder: Path) -> FleetMach
     recordings = tuple(str((folder / Path(r).expanduser()).resolve()) for r in part.recordings)
     how = {name: own(name) for name in _Training.model_fields}
     return FleetMachine(file.stem, str(file), recordings, **how)
-
-
-def _repeated(names: Iterable[str]) -> Iterator[tuple[int, str]]:
-    seen = set()
-    for k, name in enumerate(names):
-        if name in seen:
-            yield k, name
-        seen.add(name)
 
 
 def _known(values: tuple[str, ...], allowed: Iterable[str]) -> tuple[str, ...]:
