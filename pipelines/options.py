@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +12,6 @@ from data.errors import InputError, closest
 
 MachineFile = Annotated[Path, typer.Option("--machine", help="machine file (.yml)")]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of tables")]
-Workers = Annotated[int | None, typer.Option(help="processes; default: one per core")]
 
 
 def split(given: str) -> tuple[str, ...]:
@@ -33,14 +31,3 @@ def names(given: str, allowed: Iterable[str], kind: str) -> tuple[str, ...]:
         if n not in known:
             raise InputError(f"unknown {kind} {n!r}: {closest(n, known)}")
     return chosen or known
-
-
-def processes(workers: int | None) -> int:
-    """The number of processes; one per core by default.
-
-    Raises:
-        InputError: fewer than one.
-    """
-    if workers is not None and workers < 1:
-        raise InputError(f"--workers: got {workers}, expected 1 or more")
-    return workers or os.cpu_count() or 1

@@ -11,8 +11,9 @@ import typer
 
 from data.errors import InputError, one_of
 from pipelines import console
-from pipelines.options import Json, Workers, processes, split
+from pipelines.options import Json, split
 from reports.labels import NOTHING, count
+from thermodrift_exam.commands import Workers, processes
 from thermodrift_exam.proof.spec import PLANT_KINDS
 
 if TYPE_CHECKING:

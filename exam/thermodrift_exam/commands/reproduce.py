@@ -10,8 +10,9 @@ import typer
 
 from data.errors import InputError, closest
 from pipelines import console
-from pipelines.options import Json, Workers, processes
+from pipelines.options import Json
 from reports.labels import number, percent
+from thermodrift_exam.commands import Workers, processes
 
 if TYPE_CHECKING:
     import pandas as pd
