@@ -10,6 +10,8 @@ import typer
 
 from data.errors import InputError, masked
 from pipelines import console, stopping
+from pipelines.commands import load_settings
+from pipelines.home import home
 from pipelines.options import Json
 
 if TYPE_CHECKING:
@@ -56,12 +58,10 @@ def compensate(
     from compensation.serving import StateFile, serve
     from pipelines.commands.predict import load_model
     from pipelines.jobs.compensating import Given, check_standing, compensator
-    from pipelines.settings import configure_environment, home, load
 
     if not period_s > 0:
         raise InputError(f"--period-s: got {period_s:g}, expected seconds above 0, e.g. 10")
-    configure_environment()
-    settings = load()
+    settings = load_settings()
     stored = [load_model(m, settings) for m in models]
     check_standing(dict(zip(models, stored, strict=True)), provisional)
     machine = stored[0].machine
@@ -132,11 +132,9 @@ def rehearse(
     from pipelines.commands.predict import load_model
     from pipelines.jobs.compensating import Given, labelled, rehearse_models
     from pipelines.jobs.recordings import check_recordings, played_files
-    from pipelines.settings import configure_environment, home, load
     from reports.rehearsal import write_rehearsal
 
-    configure_environment()
-    settings = load()
+    settings = load_settings()
     named = _named("rehearse", models, model)
     stored = [load_model(m, settings) for m in named]
     machine = stored[0].machine
@@ -187,10 +185,8 @@ def export(
     """Write the receiver for a control, or a model as C, structured text, ONNX or JSON, with limits and fallback."""
     from pipelines.commands.predict import model_folder
     from pipelines.jobs.compensating import Given, write_export
-    from pipelines.settings import configure_environment, load
 
-    configure_environment()
-    settings = load()
+    settings = load_settings()
     folders = {m: model_folder(m, settings) for m in _named("export", models, model)}
     given, paths = write_export(folders, to, out, Given(max_um, rate_um_per_s, stale_s=stale_s), period_s, provisional)
     remarks = [f"{a.axis}: {a.remark}" for a in given.axes if a.remark]

@@ -12,6 +12,7 @@ import typer
 from data.errors import InputError, WorkError
 from data.units import unit_label
 from pipelines import console
+from pipelines.commands import load_settings
 from pipelines.options import Json, split
 from reports.labels import count, digits_of, number
 
@@ -146,9 +147,7 @@ def diagnose(
     as_json: Json = False,
 ) -> None:
     """Why simulation and recordings differ: which physics is missing, where, when, and how much better it fits."""
-    from pipelines import settings
-
-    settings.configure_environment()
+    settings = load_settings()
     from pipelines.jobs.continuing import continue_diagnosis
     from pipelines.jobs.diagnosing import DiagnosisRequest, diagnose_file
 
@@ -156,12 +155,12 @@ def diagnose(
     if earlier is not None:
         _check_alone(earlier, {"--out": to, "--batches": batches, "--overwrite": overwrite})
         with console.progress(as_json) as (say, done):
-            outcome = continue_diagnosis(earlier, given, settings.load(), machine, seed, report, say=say, done=done)
+            outcome = continue_diagnosis(earlier, given, settings, machine, seed, report, say=say, done=done)
     else:
         file, out = _needed("--machine", machine), _needed("--out", to)
         request = DiagnosisRequest(file, out, given, split(batches), seed or 0, report, overwrite)
         with console.progress(as_json) as (say, done):
-            outcome = diagnose_file(request, settings.load(), say, done)
+            outcome = diagnose_file(request, settings, say, done)
     if as_json:
         console.print_json(diagnosis_dict(outcome))
     else:

@@ -28,9 +28,7 @@ def list_(
     as_json: Json = False,
 ) -> None:
     """Machines in the lake, or the batches of one machine, withdrawn ones included."""
-    from pipelines.jobs.recordings import home_lake
-
-    lake = home_lake()
+    lake = _lake()
     rows = [_machine_row(lake, m) for m in lake.machines(withdrawn=True)]
     if machine is not None:
         rows = [{"batch": i, **_version_row(versions[-1])} for i, versions in lake.contents(machine).items()]
@@ -50,9 +48,7 @@ def show(
     as_json: Json = False,
 ) -> None:
     """One batch: versions, sources, findings, withdrawal, and the trainings and models that used it."""
-    from pipelines.jobs.recordings import home_lake
-
-    lake = home_lake()
+    lake = _lake()
     versions = lake.versions(machine, batch)
     last = versions[-1]
     kept = last.withdrawn is None or not last.withdrawn.purged_at
@@ -81,25 +77,19 @@ def show(
 @app.command()
 def withdraw(machine: MachineName, batches: Batches, reason: Reason, as_json: Json = False) -> None:
     """Take batches out of use until `restore`: no training loads them, and the same content is not stored again."""
-    from pipelines.jobs.recordings import home_lake
-
-    _print_withdrawn(machine, home_lake().withdraw(machine, batches, reason), as_json)
+    _print_withdrawn(machine, _lake().withdraw(machine, batches, reason), as_json)
 
 
 @app.command("forget-machine")
 def forget_machine(machine: MachineName, reason: Reason, as_json: Json = False) -> None:
     """Withdraw every batch of a machine; `purge --quarantined` then deletes what the lake holds of it."""
-    from pipelines.jobs.recordings import home_lake
-
-    _print_withdrawn(machine, home_lake().forget_machine(machine, reason), as_json)
+    _print_withdrawn(machine, _lake().forget_machine(machine, reason), as_json)
 
 
 @app.command()
 def restore(machine: MachineName, batches: Batches, as_json: Json = False) -> None:
     """Bring withdrawn batches back into use; purged ones can then be ingested again."""
-    from pipelines.jobs.recordings import home_lake
-
-    lake = home_lake()
+    lake = _lake()
     ids = lake.restore(machine, batches)
     held = lake.batch_ids(machine)
     again = [i for i in ids if i not in held]
@@ -125,9 +115,8 @@ def purge(
 ) -> None:
     """Delete the content of withdrawn batches for good; reason and digest stay, and keep the same content out."""
     from data.manifest import chosen
-    from pipelines.jobs.recordings import home_lake
 
-    lake = home_lake()
+    lake = _lake()
     contents = lake.contents(machine)
     doomed = {i: files for i, versions in contents.items() if (files := _withdrawn_files(lake, versions))}
     if not doomed and not quarantined:
@@ -166,6 +155,12 @@ def migrate(as_json: Json = False) -> None:
     )
     for line in done.damaged:
         console.note(f"damaged: {line}; ingest its source again")
+
+
+def _lake() -> Lake:
+    from pipelines.jobs.recordings import home_lake  # takes long to load
+
+    return home_lake()
 
 
 def _withdrawn_files(lake: Lake, versions: Sequence[Version]) -> list[str]:

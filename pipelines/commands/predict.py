@@ -13,6 +13,7 @@ import typer
 from data.errors import InputError, check_suffix
 from data.files import check_folder
 from data.units import error_column, in_error_unit
+from pipelines.commands import load_settings
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -180,13 +181,12 @@ def predict(
 ) -> None:
     """Predict the error of a recording, with the error to expect; runs unlike the training are flagged."""
     from pipelines import console
-    from pipelines.settings import configure_environment, load
 
-    configure_environment()
+    settings = load_settings()
     if to is not None:
         check_suffix("--out", to, (".csv", ".parquet"))
         check_folder(to.parent, (), overwrite=True)
-    table = predict_file(model, file, load())
+    table = predict_file(model, file, settings)
     if to is not None and to.suffix == ".parquet":
         table.to_parquet(to, index=False)
     else:

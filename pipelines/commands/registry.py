@@ -14,6 +14,7 @@ import typer
 
 from data.errors import InputError, WorkError, closest
 from pipelines import console
+from pipelines.commands import load_settings
 from pipelines.options import Json, MachineFile
 
 if TYPE_CHECKING:
@@ -253,10 +254,7 @@ def registry(
     as_json: Json = False,
 ) -> None:
     """Which version is or was the champion, who made it that and why, and what it was made from."""
-    from pipelines import settings
-
-    settings.configure_environment()
-    found = look_up(model, at or None, machine or None, lineage, settings.load())
+    found = look_up(model, at or None, machine or None, lineage, load_settings())
     if as_json:
         console.print_json(_plain(found, at))
     elif isinstance(found, Lineage):
@@ -381,12 +379,10 @@ def promote(
     force: Annotated[bool, typer.Option("--force", help="replace the champion though it is not beaten")] = False,
 ) -> None:
     """Promote a cell of a tracked training: refit on its batches, register, compare with the champion."""
-    from pipelines import settings
-
-    settings.configure_environment()
+    settings = load_settings()
     from pipelines.jobs.training import promote_tracked
 
-    console.line(promote_tracked(training, machine, cell, force, settings.load()).summary)
+    console.line(promote_tracked(training, machine, cell, force, settings).summary)
 
 
 def rollback(
@@ -397,9 +393,7 @@ def rollback(
     ] = None,
 ) -> None:
     """Make the champion before the present one the champion again; what was rolled back is not returned to."""
-    from pipelines import settings
-
-    settings.configure_environment()
+    settings = load_settings()
     from pipelines.store import registry
 
-    console.line(registry.rollback(model, settings.load(), reason, of).summary)
+    console.line(registry.rollback(model, settings, reason, of).summary)

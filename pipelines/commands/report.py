@@ -11,6 +11,8 @@ import typer
 from data.errors import InputError, check_suffix, closest
 from pipelines import console
 from pipelines.caller import Say
+from pipelines.commands import load_settings
+from pipelines.home import home
 
 if TYPE_CHECKING:
     from data.batch import Batch
@@ -25,21 +27,20 @@ def write_comparison(machine: str, training_ids: Sequence[str], to: Path | None,
         InputError: a path whose suffix does not fit the form, an unknown training, or none tracked.
         WorkError: the store does not answer.
     """
-    from pipelines import settings
+    configured = load_settings()
     from pipelines.jobs.request import REPORT_SUFFIXES
     from pipelines.store import tracking
     from reports.comparison import write_report
 
     if to is not None:
         check_suffix("--out", to, (f".{form}",) if form else REPORT_SUFFIXES)
-    configured = settings.load()
     ids = list(training_ids)
     if not ids:
         past = tracking.trainings(machine, None, configured)
         if past.empty:
             raise InputError(f"no training of {machine!r} is tracked; call `thermodrift train` first")
         ids = past.drop_duplicates("target")["training_id"].tolist()
-    path = to or settings.home() / "reports" / f"{machine}.{form or 'html'}"
+    path = to or home() / "reports" / f"{machine}.{form or 'html'}"
     write_report([tracking.load_training(i, configured) for i in ids], path, configured.promotion)
     return path
 
@@ -117,9 +118,6 @@ def report(
     ] = None,
 ) -> None:
     """A comparison report from tracked trainings; with --iso a thermal test's report from every recording."""
-    from pipelines import settings
-
-    settings.configure_environment()
     if form not in ("", "html", "md"):
         raise InputError(f"--format: got {form!r}, expected html or md")
     if sheet is not None and not iso:
@@ -131,7 +129,7 @@ def report(
         raise InputError("--format: with --iso both forms are written; leave it out")
     from pipelines.jobs.recordings import home_lake
 
-    folder = to or settings.home() / "reports" / f"iso-{Path(machine).stem}"
+    folder = to or home() / "reports" / f"iso-{Path(machine).stem}"
     with console.progress(False) as (say, _):
         for path in write_thermal_tests(Path(machine), subjects or (), folder, home_lake(), sheet, say):
             console.line(path)

@@ -14,6 +14,7 @@ from urllib.parse import quote
 import typer
 
 from pipelines import console
+from pipelines.commands import load_settings
 from pipelines.home import home
 from pipelines.options import Json
 
@@ -177,21 +178,16 @@ def _deliver() -> None:
     """What the tracking store does not have yet, see `pipelines.store.spool`."""
     if not any((home() / "spool").glob("[0-9]*")):
         return
-    from pipelines import settings
-
-    settings.configure_environment()
+    configured = load_settings()
     from pipelines.jobs.training import promote_waiting
     from pipelines.store import spool
 
-    configured = settings.load()
     spool.deliver(configured, partial(promote_waiting, configured), console.note)
 
 
 def _gathered(quiet: bool) -> dict[str, Any]:
-    from pipelines import settings
-
-    settings.configure_environment()
+    settings = load_settings()
     from pipelines.fleet.watching import refresh
 
     with console.progress(quiet) as (say, _):
-        return refresh(settings.load(), say)
+        return refresh(settings, say)

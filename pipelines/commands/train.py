@@ -14,6 +14,7 @@ from data.errors import InputError, WorkError, one_of
 from data.files import write_atomic
 from data.units import error_column, in_error_unit, unit_label
 from pipelines import console
+from pipelines.commands import load_settings
 from pipelines.commands.ingest import ingest_totals, print_ingest
 from pipelines.options import Json, MachineFile, names, split
 
@@ -203,9 +204,7 @@ def train(
     as_json: Json = False,
 ) -> None:
     """The main job: ingest → features → grid → track → promote → report."""
-    from pipelines import settings
-
-    settings.configure_environment()
+    configured = load_settings()
     from features.selectors import SELECTORS
     from models.families import FAMILIES
     from models.protocols import PROTOCOLS
@@ -216,7 +215,6 @@ def train(
     one_of(engine, ENGINES, "--engine")
     if direct and engine not in ("prefect", "direct"):
         raise InputError(f"--direct is --engine direct; got --engine {engine} as well; give one of them")
-    configured = settings.load()
     plan = Plan(
         names(selectors, SELECTORS, "selector") if selectors else (),
         names(families, FAMILIES, "family") if families else (),
