@@ -172,7 +172,7 @@ def _gathered(
     for c in champions:
         try:
             if c.source:
-                folder = registry.version_folder(c, settings)
+                folder = registry.version_folder(c.source, c.tags, settings)
                 models[c.target] = model_store.load(folder)
         except (InputError, WorkError) as error:
             trouble[c.target] = str(error)

@@ -13,7 +13,7 @@ from functools import cached_property
 from importlib.metadata import PackageNotFoundError, requires
 from importlib.metadata import version as installed
 from pathlib import Path
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, get_args
 
 import mlflow
 import pandas as pd
@@ -448,27 +448,19 @@ def find_version(client: MlflowClient, name: str, which: str) -> ModelVersion:
     return versions[which]
 
 
-class Registered(Protocol):
-    """A version as the registry has it; its tag ``sha256`` is `model_store.digest`, absent in an earlier program's."""
-
-    @property
-    def source(self) -> str: ...
-    @property
-    def tags(self) -> Mapping[str, str]: ...
-
-
-def version_folder(version: Registered, settings: Settings) -> Path:
-    """The local folder of a registered version's files, which are those that were registered.
+def version_folder(source: str, tags: Mapping[str, str], settings: Settings) -> Path:
+    """The local folder of the files of a registered version with this source and these tags, as they were registered.
 
     Raises:
         InputError: `model.json` is another one.
     """
-    place = _place(version, settings)
+    place = _place(source, tags, settings)
     return model_store.verified(Path(place.folder), place.sha256)
 
 
-def _place(version: Registered, settings: Settings) -> lookups.Place:
-    return lookups.Place(local_folder(version.source, settings), version.tags.get("sha256", ""))
+def _place(source: str, tags: Mapping[str, str], settings: Settings) -> lookups.Place:
+    """The tag ``sha256`` is `model_store.digest`; an earlier program's version has none."""
+    return lookups.Place(local_folder(source, settings), tags.get("sha256", ""))
 
 
 def look_up(name: str, which: str, known: lookups.Registry, settings: Settings) -> lookups.Place:
@@ -477,7 +469,7 @@ def look_up(name: str, which: str, known: lookups.Registry, settings: Settings) 
     with store_errors(settings):
         version = find_version(client, name, which)
         aliases = _aliases(client)
-    place = _place(version, settings)
+    place = _place(version.source, version.tags, settings)
     lookups.keep(known, aliases, {f"{name}/{version.version}": place}, settings.home)
     return place
 
@@ -489,7 +481,8 @@ def remember(versions: Iterable[tuple[str, int]], settings: Settings) -> None:
     """
     known, client = lookups.kept(settings), open_store(settings)
     with store_errors(settings):
-        found = {f"{n}/{v}": _place(client.get_model_version(n, str(v)), settings) for n, v in versions}
+        held = [client.get_model_version(name, str(number)) for name, number in versions]
+        found = {f"{v.name}/{v.version}": _place(v.source, v.tags, settings) for v in held}
         lookups.keep(known, _aliases(client), found, settings.home)
 
 
@@ -535,7 +528,7 @@ def _against(
 
 def _score_unseen(champion: ModelVersion, unseen: Sequence[Batch], target: str, settings: Settings) -> pd.DataFrame:
     """S of the champion's own predictions on batches it was not trained on: batch_id, digest, S_um."""
-    model = model_store.load(version_folder(champion, settings))
+    model = model_store.load(version_folder(champion.source, champion.tags, settings))
     rows = []
     for b in unseen:
         try:

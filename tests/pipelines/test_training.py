@@ -199,7 +199,8 @@ def test_the_next_command_needs_no_mlflow_to_find_the_champion(story: Story, sto
     place = story.steps["known"].place(MODEL, "champion")
     assert place == story.steps["known"].place(MODEL, "2")
     client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
-    folder = registry.version_folder(client.get_model_version(MODEL, "2"), store)
+    version = client.get_model_version(MODEL, "2")
+    folder = registry.version_folder(version.source, version.tags, store)
     assert Path(place.folder) == folder and place.sha256
 
 

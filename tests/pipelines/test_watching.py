@@ -235,7 +235,7 @@ def test_a_home_that_cannot_be_written_is_read_all_the_same(place: Place, monkey
 def test_a_look_up_of_a_model_writes_nothing_into_its_folder(place: Place) -> None:
     client = registry.open_store(place.settings)
     version = registry.find_version(client, f"{NAME}-z", "champion")
-    folder = Path(registry.version_folder(version, place.settings))
+    folder = Path(registry.version_folder(version.source, version.tags, place.settings))
     assert (folder / "artifacts" / "model.json").exists() and not (folder / "registered_model_meta").exists()
 
 
