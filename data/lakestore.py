@@ -16,7 +16,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 from datetime import timedelta
 from functools import cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -35,72 +35,21 @@ class Locked(Exception):
     """Another writer holds the lake for longer than `LOCK_WAIT_S`."""
 
 
-class Store(Protocol):
-    """Files below one root. What cannot be done raises OSError."""
-
-    name: str  # as messages have it, without secrets
-    exclusive: bool  # within `locked` nobody else writes
-
-    def read(self, file: str) -> bytes:
-        """The content; raises FileNotFoundError where there is none."""
-
-    def read_many(self, files: Sequence[str]) -> Iterable[bytes | OSError]:
-        """The contents, in the files' order, or why one cannot be read."""
-
-    def read_stamped(self, file: str) -> tuple[bytes | None, Stamp]:
-        """The content and the state that it is of, see `swap`; None where there is no such file."""
-
-    def exists(self, file: str) -> bool: ...
-
-    def size(self, file: str) -> int:
-        """In bytes; 0 where there is no such file."""
-
-    def stamp(self, file: str) -> Stamp:
-        """Changes whenever the file does; None where there is none."""
-
-    def files(self, folder: str) -> list[str]:
-        """Names of the files in a folder, sorted; empty for none."""
-
-    def write(self, file: str, body: Any, keep: bool = True, private: bool = False) -> None:
-        """Put bytes, or the copy of a file of this computer, there in one step.
-
-        `keep`: nobody is to write it again; `private`: only its owner reads it, where there are such rights.
-        """
-
-    def swap(self, file: str, body: bytes, stamp: Stamp, private: bool = False) -> bool:
-        """Put bytes there unless the file is no longer as it was read, within `locked`; False where it is not."""
-
-    def repeat(self, file: str, source: str) -> bool:
-        """Make `file` hold what the file `source` holds, in one step; False where it does already."""
-
-    def move(self, file: str, target: str) -> None: ...
-
-    def delete(self, file: str) -> None:
-        """Delete a file, where there is one, and the folders that it leaves empty."""
-
-    def settle(self, files: Iterable[str]) -> None:
-        """Make renames of these files survive a power cut."""
-
-    def path(self, file: str) -> Path:
-        """Where it is on this computer; below the root, where the root is elsewhere."""
-
-    def locked(self) -> AbstractContextManager[None]:
-        """A context that one writer at a time is in, where the place is `exclusive`; raises Locked."""
-
-
 class Folder:
-    """A folder of this computer, made by the first write."""
+    """A folder of this computer, made by the first write. What cannot be done raises OSError."""
 
-    exclusive = True
+    exclusive = True  # within `locked` nobody else writes
 
     def __init__(self, root: Path) -> None:
-        self.root, self.name = root, str(root)
+        self.root, self.name = root, str(root)  # the name as messages have it, without secrets
         self._lock = FileLock(root / ".lock", timeout=LOCK_WAIT_S)
 
     def read(self, file: str) -> bytes:
+        """The content; raises FileNotFoundError where there is none."""
         return (self.root / file).read_bytes()
 
     def read_many(self, files: Sequence[str]) -> Iterator[bytes | OSError]:
+        """The contents, in the files' order, or why one cannot be read."""
         for file in files:  # one at a time in memory
             try:
                 yield self.read(file)
@@ -108,6 +57,7 @@ class Folder:
                 yield error
 
     def read_stamped(self, file: str) -> tuple[bytes | None, Stamp]:
+        """The content and the state that it is of, see `swap`; None where there is no such file."""
         try:
             return self.read(file), self.stamp(file)
         except FileNotFoundError:
@@ -117,10 +67,12 @@ class Folder:
         return (self.root / file).exists()
 
     def size(self, file: str) -> int:
+        """In bytes; 0 where there is no such file."""
         path = self.root / file
         return path.stat().st_size if path.exists() else 0
 
     def stamp(self, file: str) -> Stamp:
+        """Changes whenever the file does; None where there is none."""
         try:
             seen = (self.root / file).stat()
         except OSError:
@@ -128,10 +80,15 @@ class Folder:
         return ("inode", seen.st_ino), ("size", seen.st_size), ("mtime_ns", seen.st_mtime_ns)
 
     def files(self, folder: str) -> list[str]:
+        """Names of the files in a folder, sorted; empty for none."""
         path = self.root / folder
         return sorted(p.name for p in path.iterdir() if p.is_file()) if path.is_dir() else []
 
     def write(self, file: str, body: Any, keep: bool = True, private: bool = False) -> None:
+        """Put bytes, or the copy of a file of this computer, there in one step.
+
+        `keep`: nobody is to write it again; `private`: only its owner reads it, where there are such rights.
+        """
         target, temporary = self.root / file, self.root / _TMP / "next"
         target.parent.mkdir(parents=True, exist_ok=True)
         if isinstance(body, Path):
@@ -149,10 +106,12 @@ class Folder:
         _sync(target.parent)
 
     def swap(self, file: str, body: bytes, stamp: Stamp, private: bool = False) -> bool:
+        """Put bytes there unless the file is no longer as it was read, within `locked`; False where it is not."""
         self.write(file, body, keep=False, private=private)
         return True
 
     def repeat(self, file: str, source: str) -> bool:
+        """Make `file` hold what the file `source` holds, in one step; False where it does already."""
         target, version = self.root / file, self.root / source
         if target.exists() and (target.samefile(version) or filecmp.cmp(target, version, shallow=False)):
             return False
@@ -171,6 +130,7 @@ class Folder:
         (self.root / file).replace(self.root / target)
 
     def delete(self, file: str) -> None:
+        """Delete a file, where there is one, and the folders that it leaves empty."""
         path = self.root / file
         path.unlink(missing_ok=True)
         for folder in path.parents:
@@ -179,15 +139,18 @@ class Folder:
             folder.rmdir()
 
     def settle(self, files: Iterable[str]) -> None:
+        """Make renames of these files survive a power cut."""
         for folder in {(self.root / file).parent for file in files}:
             _sync(folder)
 
     def path(self, file: str) -> Path:
+        """Where it is on this computer; below the root, where the root is elsewhere."""
         return self.root / file
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Also removes the files of an interrupted writer."""
+        """A context that one writer at a time is in, where the place is `exclusive`; raises Locked. Also removes the
+        files of an interrupted writer."""
         (self.root / _TMP).mkdir(parents=True, exist_ok=True)
         try:
             with self._lock:
@@ -200,7 +163,8 @@ class Folder:
 
 class Bucket:
     """Objects below an address that obstore reaches (``s3://``, ``gs://``, ``az://``), with its variables and, for S3,
-    the credentials that boto3 finds. No lock: what two writers may change is put only where nobody else has."""
+    the credentials that boto3 finds; methods as of `Folder`. No lock: what two writers may change is put only where
+    nobody else has."""
 
     exclusive = False
 
@@ -308,6 +272,9 @@ class Bucket:
             raise
         except Exception as error:
             raise OSError(_first_line(error)) from None
+
+
+Store = Folder | Bucket
 
 
 @cache
