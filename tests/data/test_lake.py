@@ -114,15 +114,6 @@ def test_new_findings_refresh_the_version_and_keep_the_old_ones(place: Path | st
     assert lake.put(make(findings=(FINDING,))).status == "unchanged"
 
 
-def test_a_source_that_changes_back_is_the_newest_version_again(place: Path | str) -> None:
-    lake = Lake(place)
-    for seed in (1, 2, 1):
-        lake.put(make(seed=seed))
-    assert [v.version for v in lake.versions("vmc", "run1")] == [1, 2, 3]
-    same(lake.load("vmc", "run1"), make(seed=1))
-    same(lake.load("vmc", "run1", 2), make(seed=2))
-
-
 def test_load_all_sorts_by_start_then_id(place: Path | str) -> None:
     lake = Lake(place)
     lake.put_many([make("c", start="2026-01-02"), make("z", start=None), make("b", start="2025-07-01"), make("a")])

@@ -1,7 +1,6 @@
 """Kills at every step and two writers at once: the lake shows the old or the new state, never a third."""
 
 import os
-import signal
 import time
 from pathlib import Path
 
@@ -27,28 +26,6 @@ def scenario(root: Path) -> None:
 
 def crash_scenario(base: Path) -> None:
     crash_everywhere(base, lambda root: Lake(root).put(OLD), scenario)
-
-
-def store_forever(root: Path, ready: int) -> None:
-    os.fsync = lambda fd: None
-    lake = Lake(root)
-    for seed in range(100_000):
-        lake.put_many([make("a", seed), make("b", seed + 1, f"20{10 + seed % 80}-01-01")])
-        if seed == 0:
-            os.write(ready, b"x")
-
-
-def kill_at_random(base: Path) -> None:
-    delays_s = np.random.default_rng(0).uniform(0.0, 0.04, 25)
-    for delay_s in delays_s:
-        reader, writer = os.pipe()
-        child = os.fork()
-        if child == 0:
-            store_forever(base / "lake", writer)
-        os.read(reader, 1)
-        time.sleep(delay_s)
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
 
 
 def check(root: Path) -> dict[str, list[Batch]]:
@@ -102,19 +79,6 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new_state(tmp_path: Path) -> N
         assert len(check(root)["a"]) == 2 and len(Lake(root).quarantined("vmc")) == 1
         assert len(shown_by_plain_readers(root)) == 3
     assert seen == {(False, 0), (True, 0), (True, 1)}
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_kills_at_random_moments_on_one_lake(tmp_path: Path) -> None:
-    assert run(f"kill_at_random(t.Path({str(tmp_path)!r}))", "test_lake_crash").wait(300) == 0
-    found = check(tmp_path / "lake")
-    assert len(found["a"]) > 25
-    for name, seeds in (("a", 0), ("b", 1)):
-        for batch in found[name]:  # every version is a whole batch that somebody put
-            assert any(np.array_equal(batch.values("T1"), make(name, s + seeds).values("T1")) for s in range(400))
-    Lake(tmp_path / "lake").put(make("c", 0))
-    assert shown_by_plain_readers(tmp_path / "lake")["a"] == found["a"][-1].values("T1").tolist()
 
 
 def store_range(root: Path, who: str, go: Path) -> None:

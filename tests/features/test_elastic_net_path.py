@@ -60,12 +60,6 @@ def test_a_problem_does_not_depend_on_those_beside_it() -> None:
         )
 
 
-def test_uncorrelated_inputs_join_at_their_correlation() -> None:
-    r = np.array([[0.5, -0.3, 0.0, 0.05]])
-    got = active_inputs(np.eye(4)[None], r, LEVELS)[0]
-    np.testing.assert_array_equal(got, LEVELS[:, None] < np.abs(r))
-
-
 def test_frequencies_are_shares_of_all_halves_of_few_batches() -> None:
     design = stack(*year(), LENGTHS)
     levels = np.geomspace(1.0, 1e-4, 41)

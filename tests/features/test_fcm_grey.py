@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from stacked_rows import LENGTHS, P, orthonormal, stack, year
+from stacked_rows import LENGTHS, orthonormal, stack
 
 from data.arrays import Array
 from features.grey import equations, least_squares
@@ -102,9 +102,3 @@ def test_clusters_that_fall_together_are_filled_up_and_told() -> None:
     assert FcmGrey().diagnostics(design, TRAIN, 1) == ()
     (two,) = FcmGrey().diagnostics(design, TRAIN, 2)
     assert two.ok and two.value == 0.0
-
-
-def test_the_seed_alone_decides_the_starts() -> None:
-    design = stack(*year(), LENGTHS)
-    first = FcmGrey(starts=1, seed=4).select_design(design, TRAIN, range(1, P + 1))
-    assert FcmGrey(starts=1, seed=4).select_design(design, TRAIN, range(1, P + 1)) == first

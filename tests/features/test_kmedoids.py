@@ -56,13 +56,6 @@ def test_of_a_pair_the_one_that_goes_with_the_error_stands_for_it() -> None:
             assert selector.select_design(stack(x, error, [60]), [0], [2])[2] == (first, "t2")
 
 
-def test_groups_give_one_point_each_whatever_their_sign() -> None:
-    q = orthonormal(90, 8, seed=4)
-    x = np.column_stack([(-1) ** i * q[:, i % 3] + 0.1 * q[:, 3 + i % 5] for i in range(9)])
-    got = KMedoids().select_design(stack(x, q[:, 0], [45, 45]), [0, 1], [3])[3]
-    assert sorted(int(name[1:]) % 3 for name in got) == [0, 1, 2]
-
-
 def test_silhouettes_equal_scikit_learn() -> None:
     distance, _ = distances(3)
     p = len(distance)
