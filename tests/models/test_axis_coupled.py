@@ -12,7 +12,6 @@ from data.batch import Batch, Channel
 from data.errors import InputError
 from data.machine import parse_machine
 from features.design import Design
-from models.families import FAMILIES
 from models.families.axis_coupled import AxisCoupled
 from models.families.baselines import MeanCurve
 from models.selection.crossing import Plan, prepare
@@ -226,24 +225,6 @@ def test_the_grid_crosses_channels_with_and_without_an_axis() -> None:
     assert "position_mm" not in results["z"].predictions
 
 
-def test_it_leaves_the_noise_where_others_leave_the_screw() -> None:
-    batches = [run(k, 0.5) for k in range(10)]
-    plan = Plan(("none",), ("zero", "mean_curve", "ridge", "axis_coupled"), ("leave-batch-out",))
-    cells = run_grid(batches, ["x"], plan, parse_machine(MACHINE, "m"))["x"][1].cells.set_index("family")
-    S = cells["S_mean_um"]
-    assert S["axis_coupled"] == pytest.approx(0.5 * np.sqrt(2), rel=0.15)  # noise of a reading and of its zero
-    assert S["axis_coupled"] < 0.2 * S[["zero", "mean_curve", "ridge"]].min()
-
-
-def test_folds_at_once_do_not_know_of_each_other() -> None:
-    d = design(6, noise_um=1.0)
-    folds = [[j for j in range(6) if j != i] for i in range(6)] + [[2], [1, 4]]
-    for fold, model in zip(folds, AxisCoupled().fit_folds(d, folds), strict=True):
-        alone = AxisCoupled().fit_design(d, fold)
-        assert alone.fitted["offset_inputs"] == model.fitted["offset_inputs"]
-        np.testing.assert_allclose(alone.fitted["slope_um_per_mm_K"], model.fitted["slope_um_per_mm_K"], rtol=1e-9)
-
-
 def test_the_mean_curve_along_an_axis_is_one_curve_for_each_position() -> None:
     d = design(4)
     model = MeanCurve().fit_design(d, [0, 1, 2])
@@ -263,7 +244,3 @@ def test_the_mean_curve_along_an_axis_is_one_curve_for_each_position() -> None:
     with pytest.raises(InputError, match="mean_curve: got 0 usable rows of x in b1"):
         dead = replace(run(1), table=run(1).table.assign(x=np.nan))
         MeanCurve().fit([dead], (), "x")
-
-
-def test_it_stands_in_the_registry() -> None:
-    assert FAMILIES["axis_coupled"] is AxisCoupled and AxisCoupled.needs_position

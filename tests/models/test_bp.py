@@ -12,21 +12,16 @@ from features.levenberg_marquardt import jacobian, outputs, train
 from features.nets import Nets
 from models.families.bp import BP, TRANSFERS, BPLinear
 from models.families.mlr import MLR
+from tests.toys.runs import stack
 
 
 def make_design(seed=0, sizes=(40, 25, 33, 30), p=2, law=None, ambient=None) -> Design:
     """Batches of rises; `ambient` scales each batch's rises (a cold machine rises more)."""
     rng = np.random.default_rng(seed)
-    offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    parts = []
-    for k, n in enumerate(sizes):
-        size = 1.0 if ambient is None else ambient[k]
-        parts.append(size * np.cumsum(rng.uniform(0, 0.8, (n, p)), axis=0))
-    x = np.vstack(parts)
+    scale = np.ones(len(sizes)) if ambient is None else ambient
+    x = np.vstack([s * np.cumsum(rng.uniform(0, 0.8, (n, p)), axis=0) for s, n in zip(scale, sizes, strict=True)])
     y = law(x) if law else 3 * x[:, 0] - 2 * x[:, -1] + rng.normal(0, 0.5, len(x))
-    time_s = np.concatenate([np.arange(n) * 60.0 for n in sizes])
-    return Design(tuple(f"t{j}" for j in range(p)), "z", tuple(f"K{k + 1}" for k in range(len(sizes))), x, y, time_s,
-                  offsets, 60.0)  # fmt: skip
+    return stack(x, y, sizes, step_s=60.0)
 
 
 def slopes_of(nets, x_t):
@@ -88,16 +83,6 @@ def test_torch_keeps_its_thread_count():
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
-
-
-def test_recovers_a_net_of_its_own_shape():
-    def law(x):
-        return 20 * np.tanh(0.15 * x[:, 0] - 0.1 * x[:, 1]) + 5
-
-    design = make_design(law=law)
-    model = BP(decay=0.0, iterations=200, max_rows=100).as_published().fit_design(design, [0, 1, 2])
-    left = model.predict_design(design, [3])[0] - design.y_um[design.rows(3)]
-    assert np.sqrt(np.mean(left**2)) < 0.02 * np.std(design.y_um)
 
 
 def test_small_stacks_give_what_one_stack_gives(monkeypatch):

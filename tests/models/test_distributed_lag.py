@@ -15,8 +15,6 @@ from models.families.distributed_lag import (
     RIDGES,
     DistributedLag,
     criterion,
-    effective_rows,
-    koyck_shapes,
     lag_shapes,
 )
 from models.families.linear import Task
@@ -179,17 +177,6 @@ def test_the_criteria_count_parameters_and_effective_rows(order_by):
                 assert got[f, q * len(RIDGES) + r] == pytest.approx(want, rel=1e-6)
 
 
-def test_effective_rows_of_residuals_with_a_known_memory():
-    rng, n = np.random.default_rng(10), 4000
-    e = np.zeros((3, n))
-    for t in range(1, n):
-        e[:, t] = 0.8 * e[:, t - 1] + rng.normal(size=3)
-    design = stack(rng.normal(size=(3 * n, 1)), e.ravel(), [n] * 3)
-    rho, rows = effective_rows(task_of(design, [[0, 1, 2]]), np.zeros((1, 1)))
-    assert rho[0] == pytest.approx(0.8, abs=0.02)
-    assert rows[0] == pytest.approx(3 * n / 9, rel=0.12)
-
-
 @pytest.mark.parametrize("lags", ["koyck", "almon", "free"])
 def test_a_model_learned_at_one_step_holds_at_another(lags):
     hours = [np.arange(0, n * 300, 60) / 3600 for n in SIZES]
@@ -216,12 +203,6 @@ def test_lags_are_never_closer_than_a_step():
         DistributedLag("free", lag_min=5, max_lags=2, order_by="aic").as_published().fit_design(design, range(5)).fitted
     )
     assert set(np.diff(fitted["delays_s"])) <= {900.0}
-
-
-def test_shapes():
-    used = [[np.flatnonzero(s.any(axis=1)).tolist() for s in shapes] for shapes in (lag_shapes(5, 5), koyck_shapes(2))]
-    assert used == [[list(range(q + 1)) for q in range(6)], [[0], [0, 1], [0, 2]]]
-    assert [s.shape for s in lag_shapes(4, 2)] == [(5, 1), (5, 2), (5, 3), (5, 3), (5, 3)]
 
 
 def drifting_runs(n_runs=9, n=48, step_s=300.0) -> list[Batch]:

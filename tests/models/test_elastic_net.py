@@ -43,6 +43,7 @@ def test_every_fold_is_scikit_learns_model_at_the_chosen_setting():
         other = scikit(x, y, model.fitted["alpha"], model.fitted["mixing"])
         np.testing.assert_allclose(model.fitted["coef_um_per_K"], other.coef_, rtol=0, atol=1e-6)
         assert model.fitted["intercept_um"] == pytest.approx(other.intercept_, abs=1e-6)
+        assert model.fitted["n_active"] == np.count_nonzero(model.fitted["coef_um_per_K"])
 
 
 @pytest.mark.parametrize("mixing", [1.0, 0.3])
@@ -94,18 +95,3 @@ def test_a_warm_start_ends_at_the_same_minimum():
     weight, none = 0.1 * np.abs(xy).max(axis=1), np.zeros(20)
     cold = sparse_coefficients(xx, xy, weight, none, np.zeros((20, 7)))
     np.testing.assert_allclose(sparse_coefficients(xx, xy, weight, none, rng.normal(size=(20, 7))), cold, atol=1e-12)
-
-
-def test_the_lasso_finds_the_planted_sensors():
-    rng = np.random.default_rng(5)
-    design = make_design(5, x=rng.normal(0, 3, (K * N, P)))
-    model = ElasticNet((1.0,)).as_published().fit_design(design, range(K))
-    assert set(np.argsort(-np.abs(model.fitted["coef_um_per_K"]))[:3]) == {0, 2, 5}
-    sparse = ElasticNet((1.0,), 0.2, 2)._path(_pool(design))[0, :, 1]
-    assert set(np.flatnonzero(sparse)) == {0, 2, 5}
-
-
-def test_n_active_counts_what_is_left():
-    design = make_design(7)
-    for model in ElasticNet((1.0,), 0.05, 4).as_published().fit_folds(design, FOLDS):
-        assert model.fitted["n_active"] == np.count_nonzero(model.fitted["coef_um_per_K"])

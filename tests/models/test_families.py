@@ -92,7 +92,9 @@ def by_hand() -> Design:
 
 
 @pytest.mark.parametrize(("key", "options"), [
-    *((key, {}) for key in ("mlr", "ridge", "pcr", "pcr_lbo", "pls", "bp", "bp_linear", "gaussian_process")),
+    *((key, {}) for key in (
+        "mlr", "ridge", "pcr", "pcr_lbo", "pls", "bp", "bp_linear", "gaussian_process", "lag_dictionary",
+    )),
     ("transfer_function", {}), ("transfer_function", {"drivers": True}), ("lssvm", {}), ("lssvm", {"max_rows": 45}),
 ])  # fmt: skip
 @pytest.mark.parametrize("form", ["default", "published"])

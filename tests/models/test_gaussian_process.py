@@ -8,29 +8,13 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, WhiteKernel
 
 from data.errors import InputError
-from features.design import Design
 from models.families import gaussian_process
 from models.families.gaussian_process import OWN_LINES, GaussianProcess, Line, Setting, _Problem
 from models.numerics.batch_process import LeftOut
 from models.numerics.kernels import products
+from tests.toys.runs import warm_ups
 
-NOISE_UM, OWN_SLOPE_UM_PER_K = 0.5, 0.25
-
-
-def make_design(batches=8, rows=30, seed=0, own_slope=0.0, curve_um=0.0):
-    """Two rises a batch; y = 3 a − 2 b, with a curve, with a slope of the batch's own on a, with noise."""
-    rng = np.random.default_rng(seed)
-    x, y = [], []
-    for _ in range(batches):
-        end_K = rng.uniform(5, 20, 2)
-        rise = end_K * (1 - np.exp(-np.arange(rows)[:, None] / rng.uniform(5, 15, 2)))
-        law = 3 * rise[:, 0] - 2 * rise[:, 1] + curve_um * np.sin(rise[:, 0] / 5)
-        y.append(law + own_slope * rng.normal() * rise[:, 0] + rng.normal(0, NOISE_UM, rows))
-        x.append(rise)
-    offsets = np.arange(0, (batches + 1) * rows, rows)
-    names = tuple(f"b{k}" for k in range(batches))
-    return Design(("a", "b"), "z", names, np.vstack(x), np.concatenate(y), np.tile(np.arange(rows) * 60.0, batches),
-                  offsets, 60.0, input_units=("K", "K"))  # fmt: skip
+OWN_SLOPE_UM_PER_K = 0.25
 
 
 def covariance(u, group, setting):
@@ -40,7 +24,7 @@ def covariance(u, group, setting):
 
 def test_without_batches_of_their_own_it_is_scikit_learns(monkeypatch):
     monkeypatch.setattr(Setting, "own", lambda self, dot: np.zeros_like(dot))
-    design, setting = make_design(3, 20, curve_um=4.0), Setting(100.0, 30.0, 0.7, 0.0)
+    design, setting = warm_ups(3, 20, curve_um=4.0), Setting(100.0, 30.0, 0.7, 0.0)
     model = GaussianProcess().as_published()._made(design, np.arange(60), setting, 1.0)
     # |u|²/p in the line and 2 p length² below the exponent: scikit-learn's with scaled variances and lengths.
     kernel = (
@@ -58,7 +42,7 @@ def test_without_batches_of_their_own_it_is_scikit_learns(monkeypatch):
 
 
 def test_left_out_groups_are_those_of_refits():
-    design, setting = make_design(5, 7, curve_um=3.0), Setting(1e3, 10.0, 1.0, 0.3)
+    design, setting = warm_ups(5, 7, curve_um=3.0), Setting(1e3, 10.0, 1.0, 0.3)
     u, y, group = design.x / 10, design.y_um, design.group
     whole = covariance(u, group, setting)
     left = LeftOut.of(np.linalg.inv(whole), y, 7)
@@ -77,7 +61,7 @@ def test_the_choice_is_that_of_refits_done_one_by_one(monkeypatch):
     monkeypatch.setattr(gaussian_process, "CURVES", (0.0, 10.0))
     monkeypatch.setattr(gaussian_process, "LENGTHS", (1.0,))
     monkeypatch.setattr(gaussian_process, "OWN_LINES", (0.1,))
-    design = make_design(6, 12, seed=3, curve_um=5.0)
+    design = warm_ups(6, 12, seed=3, curve_um=5.0)
     folds = [[j for j in range(6) if j != k] for k in range(6)]
     for fold, model in zip(folds, GaussianProcess().as_published().fit_folds(design, folds), strict=True):
         scores = {}
@@ -99,27 +83,8 @@ def test_the_choice_is_that_of_refits_done_one_by_one(monkeypatch):
         assert (model.fitted["line"], model.fitted["curve"]) == (line, curve)
 
 
-@pytest.mark.parametrize("own_slope", [0.0, OWN_SLOPE_UM_PER_K])
-def test_the_stated_interval_holds_on_batches_that_it_never_saw(own_slope):
-    inside, sd_um = [], []
-    for seed in range(6):
-        design = make_design(20, 24, seed=seed, own_slope=own_slope)
-        model = GaussianProcess().as_published().fit_design(design, range(12))
-        for k in range(12, 20):
-            error = design.y_um[design.rows(k)] - model.predict_design(design, [k])[0]
-            sd = model.sd_um(design, [k])[0]
-            inside.append(np.mean(np.abs(error) <= 1.6449 * sd))
-            sd_um.append(sd)
-    assert 0.85 <= np.mean(inside) <= 0.96
-    if own_slope:
-        # The batch's own slope is unknown beforehand: late rows are told to be less sure than the first.
-        assert np.mean([sd[-1] / sd[0] for sd in sd_um]) > 1.5
-    else:
-        assert np.mean(sd_um) == pytest.approx(NOISE_UM, rel=0.25)
-
-
 def test_a_curve_is_learned_and_far_from_all_rows_it_says_so():
-    design = make_design(10, 30, curve_um=6.0)
+    design = warm_ups(10, 30, curve_um=6.0)
     model = GaussianProcess().as_published().fit_design(design, range(9))
     assert model.fitted["curve"] > 0
     assert np.std(model.predict_design(design, [9])[0] - design.y_um[design.rows(9)]) < 1.0
@@ -127,14 +92,8 @@ def test_a_curve_is_learned_and_far_from_all_rows_it_says_so():
     assert model.sd_um(far, [9])[0][-1] > 3 * model.sd_um(design, [9])[0][-1]
 
 
-def test_one_batch_tells_nothing_of_how_batches_differ():
-    design = make_design(3)
-    assert np.isnan(GaussianProcess().as_published().fit_design(design, [0, 1]).sd_um(design, [2])[0]).all()
-    assert np.isfinite(GaussianProcess().as_published().fit_design(design, [0, 1, 2]).sd_um(design, [2])[0]).all()
-
-
 def test_rows_are_drawn_evenly_and_holes_stay_holes():
-    design = make_design(6, 100)
+    design = warm_ups(6, 100)
     x = design.x.copy()
     x[5, 0] = np.nan
     holed = replace(design, x=x)
@@ -145,7 +104,7 @@ def test_rows_are_drawn_evenly_and_holes_stay_holes():
 
 
 def test_what_cannot_be_learned_from_is_told():
-    design = make_design(3)
+    design = warm_ups(3)
     with pytest.raises(InputError, match=r"inputs reach 2e\+07 times their scale, expected about 1: check their units"):
         GaussianProcess().as_published().fit_design(replace(design, x=np.full_like(design.x, 2e8)), range(3))
 
@@ -154,7 +113,7 @@ def test_what_cannot_be_learned_from_is_told():
 @pytest.mark.parametrize("as_published", [False, True])
 def test_a_line_left_out_by_sums_is_what_the_whole_covariance_leaves_out(own_line: float, as_published: bool) -> None:
     """Groups of different sizes, so that there is padding; each alone, and with another."""
-    design = make_design(4, own_slope=OWN_SLOPE_UM_PER_K)
+    design = warm_ups(4, own_slope=OWN_SLOPE_UM_PER_K)
     design = design if as_published else design.started
     rows = np.setdiff1d(np.arange(120), [3, 40, 41, 42, 100])
     by_sums, whole = (_Problem.of(design, rows, design.group[rows]) for _ in range(2))

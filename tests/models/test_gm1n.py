@@ -8,25 +8,13 @@ import pytest
 from data.errors import InputError
 from features.design import Design
 from models.families.gm1n import GM1N, response
+from tests.toys.grey import literal_run
+from tests.toys.runs import stack
 
 
-def make_design(x, y, sizes, step_s=60.0, inputs=None) -> Design:
-    x = np.asarray(x, float).reshape(len(y), -1)
-    offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    time_s = np.concatenate([np.arange(n) * step_s for n in sizes])
-    names = inputs or tuple(f"t{i}" for i in range(x.shape[1]))
-    ids = tuple(f"K{k + 1}" for k in range(len(sizes)))
-    return Design(names, "z", ids, x, np.asarray(y, float), time_s, offsets, step_s)
-
-
-def literal_recursion(x, a, b):
-    """The difference response of the definition, sums and all."""
-    s = np.cumsum(x @ b)
-    out, total = np.zeros(len(x)), 0.0
-    for k in range(1, len(x)):
-        out[k] = (s[k] - a * total) / (1 + a / 2)
-        total += out[k]
-    return out
+def make_design(x, y, sizes, step_s=60.0) -> Design:
+    y = np.asarray(y, float)
+    return stack(np.asarray(x, float).reshape(len(y), -1), y, sizes, step_s=step_s)
 
 
 def generated(a, b, sizes, seed=0):
@@ -36,7 +24,7 @@ def generated(a, b, sizes, seed=0):
         one = np.cumsum(rng.uniform(0, 1, (n, len(b))), axis=0)
         one -= one[0]
         x.append(one)
-        y.append(literal_recursion(one, a, np.array(b)))
+        y.append(literal_run(one, a, np.array(b)))
     return make_design(np.vstack(x), np.concatenate(y), sizes)
 
 
@@ -65,7 +53,7 @@ def test_difference_response_is_the_recursion_on_sums():
     rng = np.random.default_rng(1)
     x, b = rng.normal(size=(50, 3)) + 2.0, np.array([1.0, -2.0, 0.5])  # first row not zero
     for a in (0.01, 0.4, 1.9):
-        np.testing.assert_allclose(response((x @ b)[None], a)[0], literal_recursion(x, a, b), atol=1e-9)
+        np.testing.assert_allclose(response((x @ b)[None], a)[0], literal_run(x, a, b), atol=1e-9)
 
 
 def test_whitening_agrees_with_difference_for_a_constant_sum_and_small_a():
@@ -110,7 +98,7 @@ def test_an_exploding_a_is_bounded_and_said():
 
 def test_zigzag_is_bounded_above():
     x = np.tile([0.0, 1.0], 20)
-    y = literal_recursion(x[:, None], 30.0, np.array([16.0]))
+    y = literal_run(x[:, None], 30.0, np.array([16.0]))
     model = GM1N().fit_design(make_design(x, y, [40]), [0])
     assert model.fitted["bound"] == "highest" and model.fitted["a"] == 2.0
 
@@ -118,7 +106,7 @@ def test_zigzag_is_bounded_above():
 def test_another_step_is_refused_with_both_named():
     model = GM1N().fit_design(generated(0.3, [1.0], [30]), [0])
     other = make_design(np.arange(10.0), np.zeros(10), [10], step_s=300.0)
-    with pytest.raises(InputError, match=r"batch K1 has a step of 300 s, the model learned from 60 s"):
+    with pytest.raises(InputError, match=r"batch b0 has a step of 300 s, the model learned from 60 s"):
         model.predict_design(other, [0])
 
 
@@ -127,7 +115,7 @@ def test_training_on_two_steps_is_refused():
     time_s = design.time_s.copy()
     time_s[30:] *= 5
     mixed = replace(design, time_s=time_s)
-    with pytest.raises(InputError, match="batch K2 has a step of 300 s, batch K1 of 60 s"):
+    with pytest.raises(InputError, match="batch b1 has a step of 300 s, batch b0 of 60 s"):
         GM1N().fit_design(mixed, [0, 1])
 
 

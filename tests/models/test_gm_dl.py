@@ -128,6 +128,7 @@ def test_where_start_temperatures_are_not_known_there_is_one_band():
     assert model.fitted["band_batches"] == [12] and model.fitted["band_degC"].size == 0
     one = GMDL(1).fit_design(built, range(12)).predict_design(built, [0])[0]
     np.testing.assert_allclose(model.predict_design(by_hand, [0])[0], one, atol=1e-8)
+    assert GMDL([10, 25], 3).fit_design(built, range(12)).fitted["band_batches"] == [3, 6, 3]
     banded = GMDL(3, 3).fit_design(built, range(12))
     alone = [
         banded.predict_design(by_hand, [0])[0],
@@ -142,13 +143,6 @@ def band_prediction(model, design, band):
     shift = model.fitted["band_degC"][band] - start_temperatures_degC(design)[0]
     moved = replace(batch, table=batch.table.assign(room=batch.table["room"] + shift))
     return model.predict_design(Design.build([moved], INPUTS, None), [0])[0]
-
-
-def test_what_is_fitted_says_which_bands_are_left():
-    design = make_design()
-    assert GMDL(4, 4).fit_design(design, range(12)).fitted["band_batches"] == [4, 4, 4]
-    assert GMDL(4, 4).fit_design(design, range(6)).fitted["band_batches"] == [6]
-    assert GMDL([10, 25], 3).fit_design(design, range(12)).fitted["band_batches"] == [3, 6, 3]
 
 
 def test_folds_at_once_are_the_folds_alone_in_bands_too():

@@ -10,6 +10,7 @@ from models.families.gm1n import GM1N, response
 from models.families.gm_lssvm import GMLSSVM
 from models.families.grey_models import grey_layers, layer_design
 from tests.toys.grey import literal_run, rises
+from tests.toys.runs import stack
 
 SIZES = (70, 55, 62, 58, 66)
 
@@ -21,9 +22,7 @@ def make_design(bend=0.0, noise_um=0.0, seed=0, step_s=300.0) -> Design:
     x = [part - part[0] for part in x]
     y = [literal_run(part, 0.4, np.array([0.8, -0.3])) for part in x]
     error = np.concatenate([v + bend * v**2 / 50 for v in y]) + rng.normal(0, noise_um, sum(SIZES))
-    return Design(("a", "b"), "z", tuple(f"K{k + 1}" for k in range(5)), np.vstack(x), error,
-                  np.concatenate([np.arange(n) * step_s for n in SIZES]),
-                  np.concatenate([[0], np.cumsum(SIZES)]).astype(np.int64), step_s)  # fmt: skip
+    return stack(np.vstack(x), error, SIZES, ("a", "b"), step_s)
 
 
 def with_other_errors(design, rows) -> Design:

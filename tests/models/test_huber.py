@@ -80,17 +80,6 @@ def test_few_rows_with_errors_of_any_size_end_at_the_minimum(seed):
         assert criterion(x, y, (at + change)[:3], (at + change)[3], 1.001) >= here * (1 - 1e-8)
 
 
-def test_nothing_far_off_is_ridge_least_squares():
-    design = make_design(2)
-    model = Huber((100.0,), 1e-12).as_published().fit_design(design, range(K))
-    other = MLR().as_published().fit_design(design, range(K))
-    np.testing.assert_allclose(model.fitted["coef_um_per_K"], other.fitted["coef_um_per_K"], rtol=0, atol=1e-8)
-    x, y, _ = design.stacked(range(K))
-    residual = y - x @ other.fitted["coef_um_per_K"] - other.fitted["intercept_um"]
-    assert model.fitted["scale_um"] == pytest.approx(np.sqrt(np.mean(residual**2)), rel=1e-8)
-    assert model.fitted["far_share"] == 0
-
-
 def test_spoiled_rows_move_least_squares_but_not_this():
     clean, spoiled = make_design(3), make_design(3, spoiled=0.15)
     true = clean.x[clean.rows(5)] @ COEF + 4

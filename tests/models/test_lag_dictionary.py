@@ -171,18 +171,6 @@ def test_an_odd_batch_is_named_and_does_not_spoil_the_others() -> None:
     assert left_out_S_um(LagDictionary(), odd)[others].mean() < 2.0 * left_out_S_um(LagDictionary(), sound).mean()
 
 
-def test_folds_that_share_every_inverse_are_the_folds_one_by_one(runs) -> None:
-    design = design_of(runs)
-    folds = [[j for j in range(8) if j != k] for k in range(8)]
-    for k, together in enumerate(LagDictionary().fit_folds(design, folds)[:3]):
-        alone = LagDictionary().fit_design(design, folds[k])
-        assert together.fitted["mistrusted"] == alone.fitted["mistrusted"]
-        np.testing.assert_allclose(
-            together.predict_design(design, [k])[0], alone.predict_design(design, [k])[0], atol=1e-5
-        )
-        np.testing.assert_allclose(together.fitted["spread_um2"], alone.fitted["spread_um2"], rtol=1e-4)
-
-
 def test_it_knows_how_sure_it_is() -> None:
     def drifting(rise, rpm, start_degC):
         walk = np.cumsum(np.random.default_rng(int(1e6 * start_degC)).normal(0, 0.6, N))

@@ -4,27 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sklearn.kernel_ridge import KernelRidge
 
 from data.errors import InputError
 from features.design import Design
 from models.families.lssvm import LSSVM
 from models.numerics import kernels as bordered
 from models.numerics.kernels import Bordered, Kernel, kernel
+from tests.toys.runs import walks
 
 SIZES = (14, 9, 12, 11, 13)
 SMALL = {"sigmas": (0.5, 2.0), "gammas": (1.0, 100.0)}
-
-
-def make_design(seed=0, sizes=SIZES, p=2, units=()) -> Design:
-    rng = np.random.default_rng(seed)
-    offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    x = np.vstack([np.cumsum(rng.uniform(0, 2, (n, p)), axis=0) for n in sizes])
-    y = 3 * x[:, 0] - 2 * x[:, -1] + 8 * np.sin(x[:, 0] / 8) + rng.normal(0, 0.5, len(x))
-    time_s = np.concatenate([np.arange(n) * 60.0 for n in sizes])
-    names = tuple(f"t{j}" for j in range(p))
-    return Design(names, "z", tuple(f"K{k + 1}" for k in range(len(sizes))), x, y, time_s, offsets, 60.0,
-                  input_units=units)  # fmt: skip
 
 
 def solved(omega, y, gamma):
@@ -39,7 +28,7 @@ def solved(omega, y, gamma):
 
 @pytest.mark.parametrize("linear", [True, False])
 def test_is_the_bordered_system(linear):
-    design = make_design()
+    design = walks()
     model = LSSVM(linear=linear, sigmas=(1.0,), gammas=(50.0,)).as_published().fit_design(design, [0, 1, 2])
     u, y = design.x[:35] / 10.0, design.y_um[:35]
     square = ((u[:, None] - u[None]) ** 2).sum(axis=2)
@@ -50,22 +39,9 @@ def test_is_the_bordered_system(linear):
     assert model.fitted["alpha"].sum() == pytest.approx(0.0, abs=1e-8)
 
 
-def test_is_kernel_ridge_with_a_free_bias():
-    design = make_design(1)
-    model = LSSVM(sigmas=(1.0,), gammas=(20.0,)).as_published().fit_design(design, range(5))
-    u, y, n = design.x / 10.0, design.y_um, len(design.y_um)
-    omega = kernel(u, u, 1.0, True)
-    centre = np.eye(n) - 1.0 / n
-    # A free bias is the same as centring features and target: both leave α = γ e.
-    ridge = KernelRidge(alpha=1 / 20.0, kernel="precomputed").fit(centre @ omega @ centre, y - y.mean())
-    np.testing.assert_allclose(model.fitted["alpha"], ridge.dual_coef_, atol=1e-7)
-    fit = ridge.predict(centre @ omega @ centre) + y.mean()
-    np.testing.assert_allclose(np.concatenate(model.predict_design(design, range(5))), fit, atol=1e-7)
-
-
 def padded(seed=2, sigma=0.7, sizes=SIZES):
     """Five groups of unlike size in one frame of equal ones: kernel, y, known, group of every place, rows per group."""
-    design, m = make_design(seed, sizes), max(sizes)
+    design, m = walks(seed, sizes), max(sizes)
     u, y, known = np.zeros((5 * m, 2)), np.zeros(5 * m), np.zeros(5 * m)
     for k in range(5):
         places = slice(k * m, k * m + sizes[k])
@@ -158,7 +134,7 @@ def brute_force(design, train, sigmas, gammas):
 
 
 def test_nested_choice_is_the_brute_force_choice():
-    design = make_design(3)
+    design = walks(3)
     folds = [[j for j in range(5) if j != k] for k in range(5)]
     sigmas, gammas = (0.3, 1.0, 3.0), (1.0, 30.0, 1000.0)
     models = LSSVM(sigmas=sigmas, gammas=gammas).as_published().fit_folds(design, folds)
@@ -170,7 +146,7 @@ def test_nested_choice_is_the_brute_force_choice():
 
 @pytest.mark.parametrize("fold", [[0, 1, 2, 3], [4]])
 def test_the_swarm_finds_at_least_what_the_grid_finds_and_its_score_is_that_of_refits(fold):
-    design = make_design(10)
+    design = walks(10)
     options = {"sigmas": (0.3, 1.0, 3.0), "gammas": (1.0, 30.0, 1000.0)}
     grid = LSSVM(**options).as_published().fit_design(design, fold).fitted
     swarm = LSSVM(**options, tuning="particle_swarm").as_published().fit_design(design, fold)
@@ -196,14 +172,14 @@ def test_the_linear_part_goes_on_where_the_rbf_falls_back_to_its_bias():
 
 
 def test_units_have_their_own_scale():
-    design = make_design(6, units=("rpm", "K"))
+    design = walks(6, units=("rpm", "K"))
     np.testing.assert_array_equal(
         LSSVM(**SMALL).as_published().fit_design(design, [0, 1]).fitted["scale"], [1000.0, 10.0]
     )
 
 
 def test_missing_rows_train_nothing_and_predict_nan():
-    design = make_design(7)
+    design = walks(7)
     x, y = design.x.copy(), design.y_um.copy()
     x[3, 0] = np.nan
     y[20] = np.nan
@@ -215,7 +191,7 @@ def test_missing_rows_train_nothing_and_predict_nan():
 
 
 def test_inputs_beyond_any_scale_are_refused_in_words():
-    design = make_design(9)
+    design = walks(9)
     huge = replace(design, x=design.x * 1e12)
     with pytest.raises(InputError, match=r"no gamma of .* check their units"):
         LSSVM().as_published().fit_design(huge, range(5))
@@ -223,7 +199,7 @@ def test_inputs_beyond_any_scale_are_refused_in_words():
 
 @pytest.mark.parametrize("linear", [True, False])
 def test_from_the_start_it_is_kernel_ridge_without_a_bias(linear):
-    design = make_design()
+    design = walks()
     f = LSSVM(linear=linear, sigmas=(1.0,), gammas=(50.0,)).fit_design(design, [0, 1, 2]).fitted
     u, y = design.started.x[:35] / 10.0, design.y_um[:35]
     origin = np.zeros((1, 2))

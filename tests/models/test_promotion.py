@@ -281,24 +281,11 @@ def test_left_out_gives_the_scores_with_their_digests():
 def _many_lucky_cells(seed: int, cells: int, gain_um: float) -> GridResult:
     """K batches, `cells` cells whose S is that of doing nothing plus luck, and one that is truly better."""
     rng = np.random.default_rng(seed)
-    ids = [f"b{i}" for i in range(8)]
-    rows, summary = [], []
-    for c in range(cells + 1):
-        family, selector = ("zero", "none") if c == 0 else ("mlr", "correlation")
-        s = np.full(8, 10.0) if c == 0 else 10.0 + 2.0 * rng.standard_normal(8) - (gain_um if c == 1 else 0.0)
-        keys = {"protocol": "leave-batch-out", "selector": selector, "family": family, "n_tsp": c}
-        rows += [
-            {**keys, "fold": b, "batch_id": b, "S_um": v, "max_abs_um": 2 * v} for b, v in zip(ids, s, strict=True)
-        ]
-        summary.append({
-            **keys, "S_mean_um": s.mean(), "S_std_um": s.std(ddof=1), "max_abs_um": 2 * s.max(), "n_batches": 8,
-            "n_parameters": c, "rank": 10, "tsp_stability": 1.0, "inputs": "a", "n_inputs": c, "simulated": False,
-        })  # fmt: skip
-    empty, batches = pd.DataFrame(), pd.DataFrame({"batch_id": ids, "digest": ids})
-    return GridResult("toy", "z", False, batches, pd.DataFrame(rows), pd.DataFrame(summary), *(4 * [empty]))
+    lucky = {f"correlation|mlr|{c}": 10.0 + 2.0 * rng.standard_normal(8) - (gain_um if c == 1 else 0.0)
+             for c in range(1, cells + 1)}  # fmt: skip
+    return scored({k: {"leave-batch-out": S_um} for k, S_um in {"none|zero|0": [10.0] * 8, **lucky}.items()})
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 def test_the_nested_score_takes_the_flattery_out_of_choosing() -> None:
     rule = PromotionRule(ties_se=0)

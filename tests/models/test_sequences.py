@@ -9,16 +9,12 @@ from features.design import Design
 from features.rises import first_order_lag
 from models.families.sequence_net import fit_memories
 from models.numerics.sequences import LAG_STEPS, Sequences, Stack, memory_columns, strides
+from tests.toys.runs import stack
 
 
 def make_design(sizes=(7, 5), p=2, step_s=60.0, seed=0, **more) -> Design:
     rng = np.random.default_rng(seed)
-    n = sum(sizes)
-    offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    time_s = np.concatenate([np.arange(m) * step_s for m in sizes])
-    ids = tuple(f"K{k + 1}" for k in range(len(sizes)))
-    x, y_um = rng.normal(size=(n, p)), rng.normal(size=n)
-    return Design(tuple(f"t{j}" for j in range(p)), "z", ids, x, y_um, time_s, offsets, step_s, **more)
+    return replace(stack(rng.normal(size=(sum(sizes), p)), rng.normal(size=sum(sizes)), sizes, step_s=step_s), **more)
 
 
 def test_rows_of_a_phase_are_a_stride_apart_and_every_row_is_in_one() -> None:

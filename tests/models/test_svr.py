@@ -4,23 +4,14 @@ import numpy as np
 import pytest
 from sklearn.svm import SVR as LibSVR
 
-from features.design import Design
 from models.families.svr import SVR
+from tests.toys.runs import walks
 
 ONE = {"sigmas": (1.0,), "costs": (2e3,), "epsilons": (0.05,)}
 
 
-def make_design(seed=0, sizes=(14, 9, 12, 11, 13), p=2, units=()) -> Design:
-    rng = np.random.default_rng(seed)
-    x = np.vstack([np.cumsum(rng.uniform(0, 2, (n, p)), axis=0) for n in sizes])
-    y = 3 * x[:, 0] - 2 * x[:, -1] + 8 * np.sin(x[:, 0] / 8) + rng.normal(0, 0.5, len(x))
-    return Design(tuple(f"t{j}" for j in range(p)), "z", tuple(f"K{k + 1}" for k in range(len(sizes))), x, y,
-                  np.concatenate([np.arange(n) * 60.0 for n in sizes]),
-                  np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64), 60.0, input_units=units)  # fmt: skip
-
-
 def test_predicts_as_scikit_learn_with_its_own_rbf_does():
-    design = make_design()
+    design = walks()
     model = SVR(**ONE).as_published().fit_design(design, [0, 1, 2, 3])
     rows = design.group < 4
     u, y = design.x / 10.0, design.y_um
@@ -34,7 +25,7 @@ def test_predicts_as_scikit_learn_with_its_own_rbf_does():
 
 
 def test_the_choice_is_the_setting_of_least_left_out_error():
-    design = make_design(2, sizes=(20, 18, 22, 19, 21, 20))
+    design = walks(2, sizes=(20, 18, 22, 19, 21, 20))
     sigmas, costs, epsilons = (0.3, 1.0), (30.0, 3e3), (0.05, 0.3)
     fitted = SVR(10_000, sigmas, costs, epsilons).as_published().fit_design(design, range(6)).fitted
     u, y, group = design.x / 10.0, design.y_um, design.group % 3
@@ -57,32 +48,10 @@ def test_the_choice_is_the_setting_of_least_left_out_error():
 
 
 def test_decimation_is_even_and_stated():
-    design = make_design(3, sizes=(40, 5, 60))
+    design = walks(3, sizes=(40, 5, 60))
     model = SVR(30, **ONE).as_published().fit_design(design, range(3))
     assert model.fitted["n_rows"] == 10 + 5 + 10 and model.fitted["n_usable_rows"] == 105
     long = design.x[design.rows(2)] / 10.0
     kept = {tuple(row) for row in long[np.round(np.linspace(0, 59, 10)).astype(int)]}
     support = {tuple(row) for row in model.fitted["support"]}
     assert support & {tuple(row) for row in long} <= kept
-
-
-def test_a_bend_that_no_straight_line_follows():
-    rng = np.random.default_rng(4)
-    sizes = (60,) * 5
-    x = np.concatenate([np.sort(rng.uniform(0, 40, n)) for n in sizes])[:, None]
-    y = 20 * np.tanh((x[:, 0] - 20) / 6) + rng.normal(0, 0.5, len(x))
-    design = Design(("t",), "z", tuple("ABCDE"), x, y, np.tile(np.arange(60.0), 5), np.arange(6) * 60, 1.0)
-    model = SVR().as_published().fit_design(design, [0, 1, 2, 3])
-    left = model.predict_design(design, [4])[0] - y[240:]
-    assert np.sqrt(np.mean(left**2)) < 1.0
-    slope = np.polyfit(x[:240, 0], y[:240], 1)
-    assert np.sqrt(np.mean((np.polyval(slope, x[240:, 0]) - y[240:]) ** 2)) > 3.0
-
-
-def test_far_outside_it_falls_back_to_its_bias():
-    design = make_design(5)
-    model = SVR(**ONE).as_published().fit_design(design, range(5))
-    far = Design(
-        design.inputs, "", ("far",), np.full((3, 2), 500.0), np.full(3, np.nan), np.arange(3.0), np.array([0, 3])
-    )
-    np.testing.assert_allclose(model.predict_design(far, [0])[0], model.fitted["bias"], atol=1e-6)

@@ -10,6 +10,7 @@ from sklearn.tree import DecisionTreeRegressor
 from features.design import Design
 from models.base import Family
 from models.families.trees import HistGradientBoosting, RandomForest, joined, walked
+from tests.toys.runs import stack
 
 
 def make_design(batches: int = 8, rows: int = 30, noise_um: float = 0.5, own_um: float = 0.0, seed: int = 0) -> Design:
@@ -18,9 +19,7 @@ def make_design(batches: int = 8, rows: int = 30, noise_um: float = 0.5, own_um:
     x = rng.uniform(0, 10, (batches * rows, 3))
     batch = np.repeat(np.arange(batches), rows)
     y = 3 * x[:, 0] + 0.4 * x[:, 1] ** 2 + rng.normal(0, noise_um, len(x)) + rng.normal(0, own_um, batches)[batch]
-    offsets = (rows * np.arange(batches + 1)).astype(np.int64)
-    time_s = np.tile(300.0 * np.arange(rows), batches)
-    return Design(("a", "b", "c"), "z", tuple(f"b{k}" for k in range(batches)), x, y, time_s, offsets, 300.0)
+    return stack(x, y, [rows] * batches)
 
 
 def test_the_walk_equals_scikit_learns_trees() -> None:

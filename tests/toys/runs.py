@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
@@ -97,12 +98,50 @@ def design(along: bool) -> Design:
     return Design.build(runs(along), INPUTS, "z", machine())
 
 
-def stack(x: Array, y: Array, lengths: list[int], inputs: tuple[str, ...] | None = None) -> Design:
-    """A design of rows made by hand: x (n, p) in K, y (n,) in µm."""
+def stack(
+    x: Array,
+    y: Array,
+    lengths: Sequence[int],
+    inputs: tuple[str, ...] | None = None,
+    step_s: float = 300.0,
+    units: tuple[str, ...] = (),
+) -> Design:
+    """A design of rows made by hand: x (n, p) in K unless `units` says otherwise, y (n,) in µm."""
     inputs = inputs or tuple(f"t{i}" for i in range(x.shape[1]))
     ids = tuple(f"b{k}" for k in range(len(lengths)))
-    time_s = np.concatenate([300.0 * np.arange(n) for n in lengths])
-    return Design(inputs, "z_um", ids, x, y, time_s, np.cumsum([0, *lengths]), 300.0)
+    time_s = np.concatenate([step_s * np.arange(n) for n in lengths])
+    return Design(inputs, "z_um", ids, x, y, time_s, np.cumsum([0, *lengths]), step_s, input_units=units)
+
+
+def walks(seed: int = 0, sizes: Sequence[int] = (14, 9, 12, 11, 13), p: int = 2, units: tuple[str, ...] = ()) -> Design:
+    """Rises that only grow, and an error that bends with the first of them, with noise of 0.5 µm."""
+    rng = np.random.default_rng(seed)
+    x = np.vstack([np.cumsum(rng.uniform(0, 2, (n, p)), axis=0) for n in sizes])
+    y = 3 * x[:, 0] - 2 * x[:, -1] + 8 * np.sin(x[:, 0] / 8) + rng.normal(0, 0.5, len(x))
+    return stack(x, y, sizes, step_s=60.0, units=units)
+
+
+NOISE_UM = 0.5
+
+
+def warm_ups(
+    batches: int = 8,
+    rows: int = 30,
+    seed: int = 0,
+    own_slope: float = 0.0,
+    curve_um: float = 0.0,
+    units: tuple[str, ...] = ("K", "K"),
+) -> Design:
+    """Two rises a batch; y = 3 a − 2 b, with a curve, with a slope of the batch's own on a, with noise."""
+    rng = np.random.default_rng(seed)
+    x, y = [], []
+    for _ in range(batches):
+        end_K = rng.uniform(5, 20, 2)
+        rise = end_K * (1 - np.exp(-np.arange(rows)[:, None] / rng.uniform(5, 15, 2)))
+        law = 3 * rise[:, 0] - 2 * rise[:, 1] + curve_um * np.sin(rise[:, 0] / 5)
+        y.append(law + own_slope * rng.normal() * rise[:, 0] + rng.normal(0, NOISE_UM, rows))
+        x.append(rise)
+    return stack(np.vstack(x), np.concatenate(y), [rows] * batches, step_s=60.0, units=units)
 
 
 def year(seed: int = 11, p: int = P) -> tuple[Array, Array]:
