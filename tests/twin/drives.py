@@ -13,6 +13,12 @@ from twin.compile import compile_network
 from twin.network import Network
 from twin.simulation.inputs import Inputs
 
+GREASE = {
+    "friction": {"law": "bearing_viscous", "drivers": "rpm", "into": {"shaft": 0.7, "head": "rest"}},
+    "grease": {"law": "viscosity_feedback", "at": {"oil": ["shaft", "head"]}, "acts_on": "friction"},
+    "spin": {"law": "rotating_convection", "drivers": "rpm", "acts_on": ["shaft-room", "shaft-head"]},
+}
+
 
 def network(**changes: Any) -> Network:
     """The two bodies in a room, changed as `tests.twin.machines.machine` does."""

@@ -9,18 +9,13 @@ import numpy as np
 import pytest
 
 from data.errors import InputError
-from tests.twin.drives import at, closed, drive, network
+from tests.twin.drives import GREASE, at, drive, network
 from twin.network import Network
 from twin.simulation import simulate
 from twin.views.heat_flows import COLUMNS, HeatFlows, heat_flows
 
 TIME_S = np.arange(0, 14401.0, 300.0)
 STOPS = np.where(np.arange(48) % 16 < 10, 5000.0, 0.0)
-GREASE = {
-    "friction": {"law": "bearing_viscous", "drivers": "rpm", "into": {"shaft": 0.7, "head": "rest"}},
-    "grease": {"law": "viscosity_feedback", "at": {"oil": ["shaft", "head"]}, "acts_on": "friction"},
-    "spin": {"law": "rotating_convection", "drivers": "rpm", "acts_on": ["shaft-room", "shaft-head"]},
-}
 
 
 def flows(net: Network, refine: int = 1, **given: Any) -> HeatFlows:
@@ -80,14 +75,6 @@ def test_a_speed_that_never_stays_counts_its_exchange_too() -> None:
     driving = out.cells_degC[0, 0, :, 0] - 20
     expected = (spin * 0.5 * (driving[1:] + driving[:-1])).reshape(96, 20).mean(axis=1)
     np.testing.assert_allclose(f.link_W["shaft-room"], expected, rtol=2e-2)
-
-
-def test_a_closed_network_stores_all() -> None:
-    f = flows(closed(network()), room=20.0)
-    np.testing.assert_allclose(sum(f.storage_W.values()), f.heat_W["belt"], atol=1e-9 * f.heat_W["belt"].max())
-    np.testing.assert_allclose(f.loss_W["room"], 0.0)
-    into_head = f.storage_W["head"]
-    np.testing.assert_allclose(f.link_W["shaft-head"], into_head, atol=1e-6 * np.abs(into_head).max())
 
 
 def test_heat_that_one_body_takes_from_another_is_put_into_none() -> None:

@@ -9,7 +9,6 @@ from twin.calibration.identifiability import (
     intervals90,
     prior_shrinkage,
     readable_names,
-    sparse_basis,
     undetermined,
 )
 from twin.calibration.least_squares import Fit, Unknown, fit
@@ -180,24 +179,6 @@ def test_the_threshold_is_the_priors_information():
         found = fit(ToyProblem(unknowns, [np.zeros(1)], linear([np.array([[slope / 2.0]])])))
         assert bool(undetermined(found, unknowns)) is told
         assert (prior_shrinkage(found, unknowns)[0] > np.sqrt(0.5)) is np.bool_(told)
-
-
-def test_sparse_basis_spans_the_null_space():
-    rng = np.random.default_rng(0)
-    null = np.linalg.qr(rng.normal(size=(12, 4)))[0]
-    basis = sparse_basis(null)
-    assert basis.shape == (12, 4)
-    np.testing.assert_allclose(null @ (null.T @ basis), basis, atol=1e-9)
-    assert np.linalg.matrix_rank(basis) == 4
-
-
-def test_sparse_basis_finds_hidden_sparse_vectors():
-    rng = np.random.default_rng(1)
-    hidden = np.zeros((20, 3))
-    hidden[[2, 9], 0], hidden[[8, 11, 15], 1], hidden[[4], 2] = (1, -1), (1, 2, 2), 1
-    basis = sparse_basis(np.linalg.qr(hidden @ rng.normal(size=(3, 3)))[0])
-    supports = {tuple(np.flatnonzero(np.abs(v) > 1e-9)) for v in basis.T}
-    assert supports == {(2, 9), (8, 11, 15), (4,)}
 
 
 def test_intervals_are_in_the_parameters_own_unit():

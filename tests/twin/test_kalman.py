@@ -154,19 +154,6 @@ def test_innovation_is_white_and_of_unit_variance_where_model_and_noise_are_righ
             assert abs(r) < 4 / np.sqrt(n)
 
 
-def test_beats_free_running_from_a_wrong_start():
-    network, given = with_grease(), inputs(batches=20)
-    rng = np.random.default_rng(5)
-    start_K2 = np.diag([9.0, 9.0])
-    start = 20.0 + rng.multivariate_normal([0, 0], start_K2, size=20)
-    readings, errors = truth(network, given, start, seed=6)
-    guess = np.full((20, 2), 20.0)
-    got = filtered(network, given, readings, Doubt(start_K2, 0.0, 0.0), guess)
-    free = simulate(network, network.values, given, guess[None]).errors[0]
-    wrong, right = errors - free, errors - got.errors
-    assert np.sqrt(np.mean(right**2)) < 0.1 * np.sqrt(np.mean(wrong**2))
-
-
 def test_finds_a_heat_that_is_stronger_than_the_file_says():
     network, given = two_bodies(), inputs()
     stronger = network.values.copy()

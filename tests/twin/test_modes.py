@@ -47,13 +47,6 @@ def test_two_bodies_even_out_with_the_reduced_capacity() -> None:
     assert modes.time_constants_s()[0, 0, 1] == pytest.approx(1 / (12.0 * (1 / 2e3 + 1 / 5e3)))
 
 
-def test_an_insulated_bar_has_the_rates_of_a_chain() -> None:
-    n = 9
-    modes = modes_of(np.full((1, n), 300.0), chain(n, 4.0)[None, None])
-    expected = 4 * 4.0 / 300.0 * np.sin(np.arange(n) * np.pi / (2 * n)) ** 2
-    assert modes.rate_per_s[0, 0] == pytest.approx(expected, rel=1e-12)
-
-
 def test_modes_rebuild_the_network_in_every_regime_and_set() -> None:
     rng = np.random.default_rng(0)
     capacity = rng.uniform(1e3, 1e6, (3, 5))

@@ -88,16 +88,6 @@ def test_many_sets_at_once_are_each_alone(
         assert many[k] == pytest.approx(one[0], rel=1e-11, abs=1e-10)
 
 
-def test_heat_adds_up() -> None:
-    toy = Toy(7)
-    response = Response(toy.modes, one_schedule(10.0, 100))
-    series = toy.series(1, 100)
-    parts = [response.forcing(toy.directions[:, :, j : j + 1], series[:, j : j + 1]) for j in range(3)]
-    start, eye = np.full((1, 1, 4), 20.0), np.eye(4)[None]
-    whole = response.run(response.forcing(toy.directions, series), start).at(eye)
-    assert response.run(parts[0] + parts[1] + parts[2], start).at(eye) == pytest.approx(whole, rel=1e-13)
-
-
 def test_a_packed_drive_serves_several_runs() -> None:
     toy = Toy(8)
     schedule = one_schedule(10.0, 60, n_batches=2)

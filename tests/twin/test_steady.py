@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 
 from data.errors import InputError
-from tests.twin.drives import at, drive, network
+from tests.twin.drives import GREASE, at, drive, network
 from twin.simulation import simulate
 from twin.simulation.start import steady_state
-
-GREASE = {
-    "friction": {"law": "bearing_viscous", "drivers": "rpm", "into": {"shaft": 0.7, "head": "rest"}},
-    "grease": {"law": "viscosity_feedback", "at": {"oil": ["shaft", "head"]}, "acts_on": "friction"},
-    "spin": {"law": "rotating_convection", "drivers": "rpm", "acts_on": "shaft-room"},
-}
 
 
 def test_two_bodies_by_hand() -> None:
