@@ -9,7 +9,6 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from mlflow import MlflowClient
 
 from data.errors import InputError, WorkError
 from models.selection.crossing import Plan
@@ -17,6 +16,7 @@ from pipelines.caller import RETRIES, DirectCaller
 from pipelines.jobs import training
 from pipelines.jobs.request import TrainRequest
 from tests.toys.small_year import write_machine, write_year
+from tests.toys.tracked import client_of
 
 pytestmark = pytest.mark.integration
 PLAN = Plan(("none", "correlation"), ("zero", "ridge", "pls"), ("leave-batch-out", "train-on-one"))
@@ -90,7 +90,7 @@ def test_a_step_that_fails_once_is_tried_again(
     outcome = flows.train_in_flow(request_for(year, "flow-shaky"), store)
     assert len(calls) == 2
     assert outcome.promotions["z"].outcome == "champion"
-    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    client = client_of(store)
     assert len(client.search_model_versions("name = 'flow-shaky-z'")) == 1
 
 

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
 from typer.testing import CliRunner
 
 from data.errors import InputError
@@ -22,25 +21,18 @@ from models.base import Family
 from models.families import FAMILIES
 from models.families.mlr import MLR
 from models.selection.conformal import RunBound
-from models.selection.promotion import choose
 from models.selection.trust import Region
 from pipelines.cli import app
 from pipelines.commands.predict import as_cell, load_model, predict_batches, predict_file, summary
 from pipelines.store import lookups, model_store, registry
-from tests.models.twin_year import recording, two_errors
-from tests.toys.tracked import log_training
-from tests.toys.training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
+from tests.toys.tracked import newcomer
+from tests.toys.training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model
 
 
 @pytest.fixture(scope="module")
 def promoted(store):
-    batches = toy_batches("toy-predict", 6)
-    result = toy_result(batches, {"none|mlr|2": [1.0] * 6})
-    model, region = toy_model(batches)
-    training_id = log_training(result, store)
-    choice = choose(result, store.promotion)
-    new = registry.Newcomer(result, choice, model, machine_yaml("toy-predict"), training_id, region)
-    return registry.promote(new, store), training_id
+    new = newcomer(store, "toy-predict", [1.0] * 6)
+    return registry.promote(new, store), new.training_id
 
 
 @pytest.fixture
@@ -257,28 +249,6 @@ def test_a_stored_model_is_plain_data_and_comes_back_equal(stored):
     batch = toy_batches("toy-folder", 4)[1]
     before, _ = toy_model(toy_batches("toy-folder", 4))
     assert np.array_equal(model_store.load(stored).predict(batch), before.predict(batch))
-
-
-@pytest.mark.parametrize("key", [k for k in FAMILIES if not FAMILIES[k].needs_position])  # those: test_axis_job.py
-def test_every_family_is_stored_without_loss(key, tmp_path):
-    cls = FAMILIES[key]
-    if cls.needs_twin:
-        machine, sensors = two_errors(), ("t_shaft", "t_head")
-        batches = [recording(machine, k) for k in range(5)]
-        text = yaml.safe_dump(machine.model_dump(mode="json", exclude_none=True), sort_keys=False)
-    else:
-        machine, sensors, batches, text = (
-            None,
-            ("front", "bed"),
-            toy_batches("toy-family", 5),
-            machine_yaml("toy-family"),
-        )
-    fitted = cls().fit(batches[:4], sensors if cls.uses_inputs else (), "z", machine)
-    model_store.save(tmp_path, fitted, text, Region.of([], ()))
-    model = model_store.load(tmp_path)
-    assert np.array_equal(model.predict(batches[4]), fitted.predict(batches[4]), equal_nan=True)
-    assert model.family.n_parameters() == fitted.n_parameters()
-    assert model.family.options() == fitted.options()
 
 
 def test_a_driver_that_the_model_follows_must_be_there(tmp_path):

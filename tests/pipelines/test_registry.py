@@ -10,7 +10,6 @@ import mlflow
 import numpy as np
 import pandas as pd
 import pytest
-from mlflow.tracking import MlflowClient
 
 from compensation.faults import FaultCost
 from data.errors import InputError
@@ -23,38 +22,17 @@ from pipelines.commands.registry import _print_overview as printed
 from pipelines.commands.registry import overview
 from pipelines.commands.status import _print_models as print_models
 from pipelines.store import audit, registry, tracking
-from tests.toys.tracked import log_training
+from tests.toys.tracked import client_of, log_training, newcomer
 from tests.toys.training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
 
 
-def train(
-    store,
-    machine: str,
-    S_um: list[float],
-    *,
-    batches_given: bool = False,
-    yaml: str = "",
-    force: bool = False,
-    **is_: Any,
-):
+def train(store, machine: str, S_um: list[float], *, force: bool = False, **more: Any):
     """Log and promote a training over len(S_um) batches."""
-    batches = toy_batches(machine, len(S_um))
-    result = toy_result(batches, {"none|zero|0": [50.0] * len(S_um), "none|mlr|2": S_um})
-    training_id = log_training(result, store)
-    model, region = toy_model(batches)
-    choice = replace(choose(result, store.promotion), **is_)
-    text, known = yaml or machine_yaml(machine), batches if batches_given else ()
-    new = registry.Newcomer(result, choice, model, text, training_id, region, known)
-    return registry.promote(new, store, force=force)
+    return registry.promote(newcomer(store, machine, S_um, **more), store, force=force)
 
 
 def aliases(store, name: str) -> dict[str, int]:
-    return {
-        a: int(v)
-        for a, v in MlflowClient(store.store_uri, registry_uri=store.store_uri)
-        .get_registered_model(name)
-        .aliases.items()
-    }
+    return {a: int(v) for a, v in client_of(store).get_registered_model(name).aliases.items()}
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +52,7 @@ def test_a_better_one_replaces_it_and_the_old_one_is_tagged(story, store):
     assert (story[1].outcome, story[1].version) == ("champion", 2)
     assert story[1].comparison is not None
     assert story[1].comparison.n_batches == 6  # the seventh is new, and the champion was never tried on it
-    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    client = client_of(store)
     assert client.get_model_version("toy-story-z", "2").tags["replaces"] == "1"
     ends = registry.status(store).set_index(["name", "version"]).loc["toy-story-z", "was_champion_until"]
     assert ends[1] and not ends[2]
@@ -84,7 +62,7 @@ def test_a_worse_one_is_challenger_with_the_reason(story, store):
     assert (story[2].outcome, story[2].version, story[2].champion_version) == ("challenger", 3, 2)
     assert (story[2].against, story[2].obstacle, story[2].forced) == (2, "", False)
     assert "not shown to be better, the champion stays" in story[2].summary
-    tags = MlflowClient(store.store_uri, registry_uri=store.store_uri).get_model_version("toy-story-z", "3").tags
+    tags = client_of(store).get_model_version("toy-story-z", "3").tags
     assert "not shown to be better" in tags["reason"]
     assert tags["simulated"] == "true"
     assert aliases(store, "toy-story-z") == {"champion": 2, "challenger": 3}
@@ -177,7 +155,7 @@ def test_roll_back_goes_to_the_version_before_and_no_further(store):
     back = registry.rollback("toy-back-z", store)
     assert back.version == 1
     assert aliases(store, "toy-back-z")["champion"] == 1
-    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    client = client_of(store)
     assert client.get_model_version("toy-back-z", "2").tags["rolled_back"] == "true"
     ends = registry.status(store).set_index(["name", "version"]).loc["toy-back-z", "was_champion_until"]
     assert ends[2] and not ends[1]
@@ -190,9 +168,7 @@ def test_roll_back_goes_to_the_version_before_and_no_further(store):
 def test_the_logged_model_has_no_pickle_and_predicts_through_plain_mlflow(story, store):
     """Held against the law that the toy batches follow."""
     folder = mlflow.artifacts.download_artifacts(
-        artifact_uri=MlflowClient(store.store_uri, registry_uri=store.store_uri)
-        .get_model_version("toy-story-z", "2")
-        .source,
+        artifact_uri=client_of(store).get_model_version("toy-story-z", "2").source,
         tracking_uri=store.store_uri,
     )
     names = {p.name for p in Path(folder).rglob("*") if p.is_file()}
@@ -216,7 +192,7 @@ def test_the_logged_model_has_no_pickle_and_predicts_through_plain_mlflow(story,
 def test_a_registered_model_that_was_changed_is_refused_whatever_it_says_of_itself(store):
     train(store, "toy-changed", [5.0, 6.0] * 3)
     load_model("models:/toy-changed-z@champion", store)
-    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    client = client_of(store)
     source = client.get_model_version("toy-changed-z", "1").source
     file = Path(registry.local_folder(source, store)) / "artifacts" / "model.json"
     file.write_text(file.read_text().replace('"n_batches": 6', '"n_batches": 9'))
@@ -228,7 +204,7 @@ def test_a_registered_model_that_was_changed_is_refused_whatever_it_says_of_itse
 def test_a_changed_loader_of_a_registered_model_is_refused(store):
     train(store, "toy-loader", [5.0, 6.0] * 3)
     load_model("models:/toy-loader-z@champion", store)
-    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    client = client_of(store)
     source = client.get_model_version("toy-loader-z", "1").source
     file = Path(registry.local_folder(source, store)) / "pyfunc_model.py"
     file.write_text(file.read_text() + "\n")
@@ -252,7 +228,7 @@ def test_a_choice_that_is_not_to_be_trusted_says_so(store):
     row = registry.status(store).set_index("name").loc["toy-zero-z"]
     assert not row["trusted"] and row["reason"] == "no trustworthy model, nothing beats zero (best other: 9.00 µm)"
     with pytest.raises(InputError, match="has no champion: no trustworthy model, nothing beats zero"):
-        registry.find_version(MlflowClient(store.store_uri, registry_uri=store.store_uri), "toy-zero-z", "champion")
+        registry.find_version(client_of(store), "toy-zero-z", "champion")
     again = registry.promote(new, store)
     assert (again.outcome, again.version, again.champion_version) == ("unchanged", 1, None)
     assert registry.promote(new, store, force=True).champion_version == 1
@@ -274,7 +250,7 @@ PROVISIONAL = {"standing": "provisional", "authority": 0.6, "caution": "not show
 
 
 def test_a_provisional_version_stands_in_until_there_is_a_champion(store):
-    client, name = MlflowClient(store.store_uri, registry_uri=store.store_uri), "toy-maybe-z"
+    client, name = client_of(store), "toy-maybe-z"
     refused = train(store, "toy-maybe", [5.0] * 6, standing="refused", caution="not shown to be better than zero")
     assert (refused.outcome, refused.standing) == ("challenger", "refused")
     first = train(store, "toy-maybe", [5.0] * 6, **PROVISIONAL)  # the same data, judged by another rule
@@ -333,7 +309,7 @@ def test_a_training_that_refuses_every_model_ends_the_provisional_one(store):
 
 def test_badges_of_a_provisional_version_are_printed(store, capsys):
     train(store, "toy-badge", [5.0] * 6, **PROVISIONAL)
-    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    client = client_of(store)
     printed(overview(client, [audit.read(client.get_registered_model("toy-badge-z"))]))
     assert capsys.readouterr().out.startswith("toy-badge-z: no champion; version 1 is provisional")
     table = registry.status(store)
@@ -343,7 +319,7 @@ def test_badges_of_a_provisional_version_are_printed(store, capsys):
 
 
 def test_the_error_to_expect_leads_the_tags(story, store):
-    tags = MlflowClient(store.store_uri, registry_uri=store.store_uri).get_model_version("toy-story-z", "2").tags
+    tags = client_of(store).get_model_version("toy-story-z", "2").tags
     assert (tags["expected_by"], float(tags["expected_S_um"])) == ("leave-batch-out", pytest.approx(33 / 7))
     assert 5.5 < float(tags["expected_S_bound90_um"]) < 11 and "optimistic" in tags["expected"]
     row = registry.status(store).set_index(["name", "version"]).loc["toy-story-z", 2]
@@ -355,7 +331,7 @@ def stacked(store):
     """Four champions, the last two by force."""
     for worse, more, force in ((1.0, 0, False), (0.0, 1, False), (9.0, 2, True), (8.0, 3, True)):
         train(store, "toy-stack", [4.0 + worse, 5.0 + worse] * 3 + [5.0] * more, force=force)
-    return MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    return client_of(store)
 
 
 def test_roll_backs_walk_down_and_never_return_to_what_was_rolled_back(store, stacked):
@@ -389,7 +365,7 @@ def test_an_interrupted_roll_back_is_finished_by_the_next_and_goes_no_further(st
     again = registry.rollback(name, store)
     assert (again.version, aliases(store, name)["champion"]) == (2, 2)
     assert "the roll-back of version 3 is finished" in again.summary
-    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    client = client_of(store)
     assert client.get_model_version(name, "3").tags["rolled_back"] == "true"
     assert registry.rollback(name, store).version == 1
 
@@ -404,7 +380,7 @@ def test_a_clock_that_was_set_back_is_named_and_orders_nothing_anew(store):
         patch = at(day)
         train(store, "toy-clock", [9.0] * runs, force=True)
         patch.undo()
-    log = audit.read(MlflowClient(store.store_uri, registry_uri=store.store_uri).get_registered_model("toy-clock-z"))
+    log = audit.read(client_of(store).get_registered_model("toy-clock-z"))
     assert [r.version for r in log.champions(audit.span_of("2026-03-20"))] == []
     last = log.champions(audit.span_of("2026-05-01"))
     assert [r.version for r in last] == [2]
@@ -421,7 +397,7 @@ def test_a_model_that_a_failed_sensor_can_ruin_is_no_champion_where_a_budget_say
     assert "a fault of a sensor costs 55 µm (front: a drift of 1 K/h), more than fault_budget_um" in refused.summary
     taken = train(within, "toy-dear", [5.0, 6.0] * 3 + [5.0])
     assert taken.outcome == "champion" and taken.faults == f"{cost.summary}; every model that was judged reads front"
-    tags = MlflowClient(store.store_uri, registry_uri=store.store_uri).get_model_version("toy-dear-z", "2").tags
+    tags = client_of(store).get_model_version("toy-dear-z", "2").tags
     assert tags["worst_fault"] == "front: a drift of 1 K/h" and tags["worst_fault_um"] == "55.0"
     assert tags["sensor_um_per_K"] == '{"front": 9.0, "bed": 2.0}'
     assert load_model("models:/toy-dear-z@champion", store).info["faults"]["missed"] == 3

@@ -6,7 +6,7 @@ import json
 import os
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,10 @@ from mlflow.tracking import MlflowClient
 
 import thermodrift as td
 from data.errors import InputError
-from models.selection.promotion import choose
 from pipelines.store import audit, registry, runs, tracking
 from tests.toys.command import Call, in_process
-from tests.toys.tracked import log_training
-from tests.toys.training import machine_yaml, toy_batches, toy_model, toy_result
+from tests.toys.tracked import client_of, newcomer
+from tests.toys.training import toy_batches
 
 MASKED = {"batch_id": "b02", "check": "spike", "channel": "front", "start_s": 60.0, "end_s": 120.0,
           "words": "front jumps", "masks": True, "overruled": ""}  # fmt: skip
@@ -51,12 +50,7 @@ def zone() -> Iterator[None]:
 
 def train(store: Any, machine: str, S_um: list[float], at: str = "", *, force: bool = False) -> registry.Promotion:
     """Log and promote a training over len(S_um) batches, at a time (UTC)."""
-    batches = toy_batches(machine, len(S_um))
-    result = toy_result(batches, {"none|zero|0": [50.0] * len(S_um), "none|mlr|2": S_um})
-    result = replace(result, findings=pd.DataFrame([dict(f) for f in FINDINGS]))
-    training_id = log_training(result, store)
-    model, region = toy_model(batches)
-    new = registry.Newcomer(result, choose(result, store.promotion), model, machine_yaml(machine), training_id, region)
+    new = newcomer(store, machine, S_um, findings=FINDINGS)
     with clock(at):
         return registry.promote(new, store, force=force)
 
@@ -73,10 +67,6 @@ def clock(at: str) -> Any:
             patch.undo()
 
     return Set()
-
-
-def client_of(store: Any) -> MlflowClient:
-    return MlflowClient(store.store_uri, registry_uri=store.store_uri)
 
 
 def log_of(store: Any, name: str) -> audit.Log:

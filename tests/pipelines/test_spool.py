@@ -31,6 +31,7 @@ from tests.toys.command import Call, in_process
 from tests.toys.mlflow_server import MlflowServer
 from tests.toys.postgres import free_port
 from tests.toys.small_year import write_machine, write_year
+from tests.toys.tracked import client_of
 from tests.toys.training import toy_batches, toy_result
 
 PLAN = Plan(("none",), ("zero", "ridge"), ("leave-batch-out",))
@@ -88,7 +89,7 @@ def test_results_wait_and_are_delivered_once(
     ]  # fmt: skip
     (training,) = [t for t in json.loads(done.out)["trainings"] if t["machine"] == "small-spool"]
     assert (training["promotion"], training["model"]) == ("champion", "small-spool-z version 1")
-    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    client = client_of(store)
     run = client.get_run(training["training_id"])
     assert run.info.start_time == outcome.records["z"].started_ms
     folder = mlflow.artifacts.download_artifacts(run_id=run.info.run_id, tracking_uri=store.store_uri)
@@ -123,7 +124,7 @@ def test_a_promotion_that_does_not_reach_the_server_waits_and_one_that_is_refuse
     assert said[1].startswith("not delivered: training of small-later z (lake ") and "is withdrawn (sold)" in said[1]
     (refused,) = (store_home / "spool" / "refused").iterdir()
     assert (refused / "reason.txt").read_text().strip() in said[1] and not spool.waiting(store)
-    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    client = client_of(store)
     assert client.list_artifacts(outcome.training_ids["z"], "report")
 
 
@@ -238,7 +239,7 @@ def test_a_real_server_that_goes_away(when: str, call: Call, tmp_path: Path, mon
         assert done.code == 0, done.err
         (training,) = json.loads(done.out)["trainings"]
         assert (training["promotion"], training["model"]) == ("champion", "small-gone-z version 1")
-        client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+        client = client_of(store)
         found = client.search_runs([client.get_run(training["training_id"]).info.experiment_id])
         status = sorted(r.info.status for r in found if r.data.tags["kind"] == "training")
         assert status == (["FINISHED", "KILLED"] if when == "within" else ["FINISHED"])

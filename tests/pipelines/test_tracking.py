@@ -20,7 +20,7 @@ from models.protocols import PromotionRule
 from models.selection.promotion import judged
 from pipelines.settings import NamesPart, Settings
 from pipelines.store import audit, runs, tracking
-from tests.toys.tracked import log_training
+from tests.toys.tracked import client_of, log_training
 from tests.toys.training import toy_batches, toy_result
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -41,7 +41,7 @@ def logged(store) -> tuple[Settings, str, object]:
 
 
 def children(settings: Settings, training_id: str) -> dict[str, object]:
-    client = MlflowClient(settings.store_uri, registry_uri=settings.store_uri)
+    client = client_of(settings)
     experiment = client.get_run(training_id).info.experiment_id
     found = client.search_runs([experiment], f"tags.mlflow.parentRunId = '{training_id}'")
     return {r.info.run_name: r for r in found}
@@ -54,7 +54,7 @@ def test_a_run_per_selector_and_family_with_points_and_folds_as_steps(logged):
     run = runs_of["correlation × mlr"]
     assert run.data.params["n_tsp"] == "2" and run.data.params["inputs"]
     assert run.info.status == "FINISHED"
-    client = MlflowClient(settings.store_uri, registry_uri=settings.store_uri)
+    client = client_of(settings)
     history = client.get_metric_history(run.info.run_id, "leave_batch_out_by_n_tsp/S_mean_um")
     assert {m.step: m.value for m in history} == {1: 5.0, 2: pytest.approx(6.5 / 3, rel=1e-4)}
     folds = client.get_metric_history(run.info.run_id, "leave_batch_out_by_fold/S_um")
@@ -65,7 +65,7 @@ def test_a_run_per_selector_and_family_with_points_and_folds_as_steps(logged):
 def test_plain_columns_are_of_the_best_cell_in_the_parent_and_in_every_child(logged):
     """The list of runs shows a metric's last step; the plain ones have one step, and mean the same in every row."""
     settings, training_id, result = logged
-    parent = MlflowClient(settings.store_uri, registry_uri=settings.store_uri).get_run(training_id)
+    parent = client_of(settings).get_run(training_id)
     models = children(settings, training_id)
     worse, best = models["correlation × mlr"].data, models["none × mlr"].data
     cells = result.cells.set_index(["selector", "family", "n_tsp"])
@@ -84,7 +84,7 @@ def test_plain_columns_are_of_the_best_cell_in_the_parent_and_in_every_child(log
 
 def test_the_page_of_an_experiment_leads_to_the_list_with_the_right_columns(logged):
     settings, training_id, _ = logged
-    client = MlflowClient(settings.store_uri, registry_uri=settings.store_uri)
+    client = client_of(settings)
     experiment = client.get_experiment(client.get_run(training_id).info.experiment_id)
     key = "mlflow.sharedViewState.trainings"
     assert f"(#/experiments/{experiment.experiment_id}/runs?viewStateShareKey=trainings)" in experiment.tags[
@@ -98,7 +98,7 @@ def test_the_page_of_an_experiment_leads_to_the_list_with_the_right_columns(logg
 
 
 def test_an_experiment_follows_the_settings_and_keeps_the_note_of_a_user(store):
-    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    client = client_of(store)
     slash = replace(store, names=NamesPart(experiment="{machine}/{target}"))
     first = runs.experiment_id(client, slash, "toy-renamed", "z", True)
     client.set_experiment_tag(first, "mlflow.note.content", "in hall 3")
@@ -130,7 +130,7 @@ def test_an_experiment_is_found_by_what_it_is_of_also_where_that_has_a_quote(sto
 
 def test_a_run_says_who_made_it_with_which_program_and_in_which_process(logged, monkeypatch):
     settings, training_id, _ = logged
-    tags = MlflowClient(settings.store_uri, registry_uri=settings.store_uri).get_run(training_id).data.tags
+    tags = client_of(settings).get_run(training_id).data.tags
     assert tags["mlflow.user"] == audit.who() and tags["mlflow.source.type"] == "LOCAL"
     assert tags["mlflow.source.name"] == "thermodrift"  # a test is another program
     program, _, commit = runs.code_version().partition(" ")
@@ -152,7 +152,7 @@ def test_a_checkout_is_known_by_its_commit():
 
 def test_the_parent_carries_batches_figures_and_the_best(logged):
     settings, training_id, result = logged
-    run = MlflowClient(settings.store_uri, registry_uri=settings.store_uri).get_run(training_id)
+    run = client_of(settings).get_run(training_id)
     assert run.info.status == "FINISHED"
     assert run.data.tags["best"] == "mlr on 2 points by none"
     inputs = {i.dataset.name: i for i in run.inputs.dataset_inputs}
@@ -165,7 +165,7 @@ def test_the_parent_carries_batches_figures_and_the_best(logged):
 
 def test_simulated_is_written_on_experiment_and_every_run(logged):
     settings, training_id, _ = logged
-    client = MlflowClient(settings.store_uri, registry_uri=settings.store_uri)
+    client = client_of(settings)
     run = client.get_run(training_id)
     experiment = client.get_experiment(run.info.experiment_id)
     assert experiment.name == "toy-tracked z"
@@ -249,7 +249,7 @@ class FakeClient:
 @pytest.mark.parametrize("target", ["Spindel vorn 50 %", "%2e%2e%2f%2e%2e%2foutside"])
 def test_artifacts_stay_in_the_folder_of_their_channel(store, tmp_path, target):
     """A store decodes the address of an experiment, so that an unquoted name may lead out of its folder."""
-    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    client = client_of(store)
     (tmp_path / "note.txt").write_text("x")
     run = client.create_run(runs.experiment_id(client, store, "toy-quoted", target, True))
     client.log_artifact(run.info.run_id, str(tmp_path / "note.txt"))

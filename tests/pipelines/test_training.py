@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from mlflow import MlflowClient
 
 from data.errors import InputError
 from data.lake import Lake
@@ -25,6 +24,7 @@ from pipelines.jobs.request import TrainRequest
 from pipelines.jobs.training import TrainOutcome, promote_tracked, train
 from pipelines.store import lookups, registry, tracking
 from tests.toys.small_year import NOISE_UM, law_um, write_machine, write_year
+from tests.toys.tracked import client_of
 
 NAME = "small-train"
 MODEL = f"{NAME}-z"
@@ -54,7 +54,7 @@ def home(store: Any, store_home: Path) -> Any:
 def story(home: Path, store: Any, tmp_path_factory: pytest.TempPathFactory) -> Story:
     folder = tmp_path_factory.mktemp("year")
     machine, files = write_machine(folder / "small.yml", NAME), write_year(folder / "in")
-    client, said = MlflowClient(store.store_uri, registry_uri=store.store_uri), []
+    client, said = client_of(store), []
     story = Story(folder, machine, files, {"said": said}, {})
 
     def step(name: str, work: Callable[[], Any]) -> None:
@@ -152,7 +152,7 @@ def test_what_cannot_be_promoted_is_told(story: Story, store: Any, tmp_path: Pat
 
 
 def test_runs_are_tracked_with_their_batches(story: Story, store: Any) -> None:
-    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    client = client_of(store)
     training_id = story.steps["better"].training_ids["z"]
     run = client.get_run(training_id)
     assert {d.dataset.name for d in run.inputs.dataset_inputs} == {f.stem for f in story.files[:6]}
@@ -171,7 +171,7 @@ def test_simulated_is_said_everywhere(story: Story, store: Any) -> None:
     assert outcome.simulated
     for table in (outcome.results["z"].cells, outcome.results["z"].batches):
         assert table["simulated"].all()
-    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    client = client_of(store)
     assert client.get_run(outcome.training_ids["z"]).data.tags["simulated"] == "true"
     assert client.get_registered_model(MODEL).tags["simulated"] == "true"
     assert client.get_model_version(MODEL, "2").description.startswith("SIMULATED. ")
@@ -198,8 +198,7 @@ def test_the_champion_predicts_a_raw_file(story: Story, store: Any, tmp_path: Pa
 def test_the_next_command_needs_no_mlflow_to_find_the_champion(story: Story, store: Any) -> None:
     place = story.steps["known"].place(MODEL, "champion")
     assert place == story.steps["known"].place(MODEL, "2")
-    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
-    version = client.get_model_version(MODEL, "2")
+    version = client_of(store).get_model_version(MODEL, "2")
     folder = registry.version_folder(version.source, version.tags, store)
     assert Path(place.folder) == folder and place.sha256
 
