@@ -21,6 +21,7 @@ from compensation.connectors import mqtt, open_sink, open_source
 from compensation.contracts import Correction, Sample, Source
 from data.errors import InputError, WorkError
 from data.machine import Machine, parse_machine
+from tests.compensation.links import MACHINE, TIMEOUT_S, eventually, taken
 
 BROKER = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin")
 pytestmark = [
@@ -28,15 +29,7 @@ pytestmark = [
     pytest.mark.skipif(BROKER is None, reason="needs the broker mosquitto: apt-get install mosquitto"),
 ]
 
-TIMEOUT_S = 60.0
 ROOT = Path(__file__).parents[2]
-MACHINE = """
-machine: mill
-channels:
-  front: {role: temperature, unit: degC}
-  room: {role: ambient, unit: degC}
-  z: {role: error, unit: um}
-"""
 CORRECTION = Correction(100.5, {"z": -12.25}, {"z": 3.5}, {"z": "active"}, {})
 LOST_COMPENSATOR = """
 import sys, time
@@ -48,13 +41,6 @@ sink.write(Correction(1.0, {"z": 2.0}, {}, {"z": "active"}))
 print("written", flush=True)
 time.sleep(600)
 """
-
-
-def eventually(condition: Callable[[], object], what: str) -> None:
-    until_s = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < until_s, what
-        time.sleep(0.05)
 
 
 class Broker:
@@ -163,22 +149,13 @@ def opened(address: str, machine: Machine, control: Control) -> Source:
     raise AssertionError("the source is not subscribed")
 
 
-def taken(source: Source, wanted: Callable[[Sample], object]) -> Sample:
-    until_s = time.monotonic() + TIMEOUT_S
-    for sample in source.samples():
-        if sample is not None and wanted(sample):
-            return sample
-        assert time.monotonic() < until_s, "no such sample"
-    raise AssertionError("the source has ended")
-
-
 def test_whole_samples(broker: Broker, control: Control, machine: Machine) -> None:
     source = opened(broker.address, machine, control)
     control.publish("sample", {"time_s": 100.5, "values": {"front": 25.5}, "readings_um": {"z": 3.0}})
-    assert taken(source, lambda s: True) == Sample(100.5, {"front": 25.5}, {"z": 3.0})
+    assert taken(source) == Sample(100.5, {"front": 25.5}, {"z": 3.0})
     before_s = time.time()
     control.publish("sample", {"front": 26, "z": 4})
-    sample = taken(source, lambda s: True)
+    sample = taken(source)
     assert (sample.values, sample.readings_um) == ({"front": 26.0}, {"z": 4.0})
     assert before_s - 1 <= sample.time_s <= time.time() + 1
     assert next(source.samples()) is None
@@ -196,7 +173,7 @@ def test_single_channels_and_readings_are_collected(broker: Broker, control: Con
         ("reading/z", 3),
     ):
         control.publish(topic, payload)
-    sample = taken(source, lambda s: True)
+    sample = taken(source)
     assert (sample.values, sample.readings_um) == ({"front": 26.0, "room": 20.5}, {"z": 3.0})
     source.close()
 
@@ -206,9 +183,9 @@ def test_a_retained_number_of_unknown_age_does_not_count(broker: Broker, control
     control.publish("channel/front", "99", retain=True)
     control.publish("sample", {"time_s": 50, "front": 21}, retain=True)  # has a time of its own
     source = open_source(f"{broker.address}?interval_s=0.2", machine)
-    assert taken(source, lambda s: True) == Sample(50.0, {"front": 21.0})
+    assert taken(source) == Sample(50.0, {"front": 21.0})
     control.publish("channel/room", "20")
-    assert taken(source, lambda s: True).values == {"room": 20.0}
+    assert taken(source).values == {"room": 20.0}
     source.close()
 
 
@@ -221,7 +198,7 @@ def test_malformed_payloads_are_skipped_and_reported(
     for topic in ("channel/front", "channel/frnt", "reading/front", "reading/z", "channel/"):
         control.publish(topic, "warm")
     control.publish("sample", {"time_s": 7, "front": "warm", "room": 20})
-    assert taken(source, lambda s: True) == Sample(7.0, {"room": 20.0})
+    assert taken(source) == Sample(7.0, {"room": 20.0})
     source.close()
     reports = capsys.readouterr().err.splitlines()
     assert all(line.startswith(f"thermodrift: {broker.address}: topic hall/mill/") for line in reports)

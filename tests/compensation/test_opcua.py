@@ -9,7 +9,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,20 +18,14 @@ import pytest
 
 from compensation.connectors import open_sink, open_source
 from compensation.connectors.opcua import OpcUaSink
-from compensation.contracts import Correction, Sample, Source
+from compensation.contracts import Correction
 from data.errors import InputError, WorkError
 from data.machine import Machine, parse_machine
+from tests.compensation import links
+from tests.compensation.links import TIMEOUT_S, eventually, taken
 
-TIMEOUT_S = 60.0
 URI = "http://maker.example/plc"
-MACHINE = """
-machine: mill
-channels:
-  front: {role: temperature, unit: degC}
-  room: {role: ambient, unit: degC}
-  z: {role: error, unit: um}
-  x: {role: error, unit: um}
-"""
+MACHINE = links.MACHINE + "  x: {role: error, unit: um}\n"
 NODES = f"""
 interval_s: 0.1
 values: {{front: "nsu={URI};s=Front", room: ns=2;s=Room}}
@@ -93,13 +87,6 @@ async def _serve(port: int, pipe: Any) -> None:
                 pipe.send(await nodes[name].write_value(ua.Variant(value, first[name][1])))
 
 
-def eventually(condition: Callable[[], object], what: str) -> None:
-    until_s = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < until_s, what
-        time.sleep(0.05)
-
-
 class Control:
     """The server's process on a free port of this computer."""
 
@@ -154,15 +141,6 @@ def control(server: Control) -> Control:
     return server
 
 
-def taken(source: Source, wanted: Callable[[Sample], object]) -> Sample:
-    until_s = time.monotonic() + TIMEOUT_S
-    for sample in source.samples():
-        if sample is not None and wanted(sample):
-            return sample
-        assert time.monotonic() < until_s, "no such sample"
-    raise AssertionError("the source has ended")
-
-
 def delivered(sink: OpcUaSink, correction: Correction = CORRECTION) -> bool:
     try:
         sink.write(correction)
@@ -175,7 +153,7 @@ def delivered(sink: OpcUaSink, correction: Correction = CORRECTION) -> bool:
 @pytest.mark.integration
 def test_all_nodes_are_read_together(control: Control, machine: Machine, capsys: pytest.CaptureFixture[str]) -> None:
     source = open_source(control.address, machine)
-    sample = taken(source, lambda s: True)
+    sample = taken(source)
     assert (sample.values, sample.readings_um) == ({"front": 20.0, "room": 19.0}, {})  # the probe's value may be old
     assert abs(sample.time_s - time.time()) < TIMEOUT_S
     control.write("Probe", 3.5)
@@ -232,7 +210,7 @@ def test_source_and_sink_recover_from_a_restart_of_the_server(
     control: Control, machine: Machine, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source, sink = open_source(control.address, machine), open_sink(control.address, machine)
-    taken(source, lambda s: True)
+    taken(source)
     sink.write(CORRECTION)
     control.stop()
     eventually(lambda: not delivered(sink), "the loss is not noticed")
