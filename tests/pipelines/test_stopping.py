@@ -7,94 +7,59 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
+import psutil
 import pytest
 
 from data.processes import Processes
 from pipelines import stopping
+from tests.toys.signalled import ROOT, Command
 from tests.toys.small_year import write_machine, write_year
 
-ROOT = Path(__file__).parents[2]
-LIMIT_S = 5.0
-pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes below /proc")
+LIMIT_S, STARTED_S = 5.0, 600.0  # until a moment is reached on a slow computer
 
 
-def of_session(leader: int) -> list[str]:
-    """Command lines of the living processes of a session."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            state, *numbers = (folder / "stat").read_text().rpartition(")")[2].split()
-            if int(numbers[2]) == leader and state != "Z":
-                found.append((folder / "cmdline").read_text().replace("\0", " "))
-        except (FileNotFoundError, ProcessLookupError):
-            pass
-    return found
+def kept(c: Command) -> set[str]:
+    return {p.name for p in c.home.glob("unfinished/*/z__*")}
 
 
-def wait_for(condition: Callable[[], object], limit_s: float) -> bool:
-    end_s = time.monotonic() + limit_s
-    while not (reached := bool(condition())) and time.monotonic() < end_s:
-        time.sleep(0.05)
-    return reached
-
-
-class Training:
-    """A training in a session of its own."""
-
-    def __init__(self, folder: Path, *more: str, **environment: str) -> None:
-        machine = write_machine(folder / "m.yml", "stopped")
-        write_year(folder / "in", 4)
-        command = ["-m", "tests.toys.endless_training", "train", "--machine", machine, "--recordings", folder / "in",
-                   "--channels", "z", "--selectors", "none", *more]  # fmt: skip
-        self.home = folder / "home"
-        self.process = subprocess.Popen(
-            [sys.executable, *map(str, command)], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            env={**os.environ, "THERMODRIFT_HOME": str(self.home), "TMPDIR": str(folder), **environment},
-            start_new_session=True,
-        )  # fmt: skip
-
-    def kept(self) -> set[str]:
-        return {p.name for p in self.home.glob("unfinished/*/z__*")}
-
-    def stop(self, number: int, group: bool) -> tuple[int, float, str]:
-        """Exit code, seconds from the signal on, and standard error."""
-        begun_s = time.monotonic()
-        (os.killpg if group else os.kill)(self.process.pid, number)
-        error = self.process.communicate(timeout=60)[1]  # at its end every process that shares the pipe is gone
-        return self.process.returncode, time.monotonic() - begun_s, error
-
-
+@pytest.mark.slow
 @pytest.mark.integration
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="looks for processes below /proc")
 @pytest.mark.parametrize(
     ("options", "endless", "number", "group"),
     [
-        pytest.param(["--direct"], "worker", signal.SIGINT, True, marks=pytest.mark.slow),
-        pytest.param(["--direct"], "here", signal.SIGTERM, False, marks=pytest.mark.slow),
-        pytest.param([], "worker", signal.SIGTERM, True, marks=pytest.mark.slow),
-        pytest.param([], "here", signal.SIGINT, False, marks=pytest.mark.slow),
+        (["--direct"], "worker", signal.SIGINT, True),
+        (["--direct"], "here", signal.SIGTERM, False),
+        ([], "worker", signal.SIGTERM, True),
+        ([], "here", signal.SIGINT, False),
     ],
 )
 def test_a_signal_ends_all_processes_and_the_next_run_resumes(
     tmp_path: Path, options: list[str], endless: str, number: int, group: bool
 ) -> None:
-    families = ("--families", "endless,zero,mlr")
-    training = Training(tmp_path, *families, *options, ENDLESS=endless)
-    assert wait_for(lambda: training.kept() == {"z__zero", "z__mlr"} or training.process.poll() is not None, 120)
-    code, seconds, error = training.stop(number, group)
-    assert wait_for(lambda: not of_session(training.process.pid), 1), of_session(training.process.pid)
-    assert (code, seconds < LIMIT_S) == (128 + number, True), (code, seconds, error)
-    last = error.splitlines()[-1]
+    write_year(tmp_path / "in", 4)
+    call = ["train", "--machine", write_machine(tmp_path / "m.yml", "stopped"), "--recordings", tmp_path / "in",
+            "--channels", "z", "--selectors", "none", "--families", "endless,zero,mlr", *options]  # fmt: skip
+
+    def begun(endless: str) -> Command:
+        return Command(tmp_path / "home", *call, module="tests.toys.endless_training", ENDLESS=endless)
+
+    training = begun(endless)
+    assert training.reached(lambda c: kept(c) == {"z__zero", "z__mlr"}, STARTED_S), training.output()
+    ended = training.stop(number, group)
+    assert (ended.code, ended.seconds < LIMIT_S, ended.left) == (128 + number, True, ()), ended
+    last = ended.error.splitlines()[-1]
     assert last.startswith("thermodrift: stopped; 2 finished parts of the crossing kept in ")
-    assert "Traceback" not in error
+    assert "Traceback" not in ended.error
     assert last.endswith("; run the same command to go on")
     assert not list(tmp_path.glob("thermodrift-*"))
     if options and endless == "worker":
-        again = Training(tmp_path, *families, *options)
-        assert wait_for(lambda: len(of_session(again.process.pid)) > 2 or again.process.poll() is not None, 120)
-        assert "resumes: 2 finished parts of the crossing were crossed on 20" in again.stop(signal.SIGTERM, False)[2]
+        again = begun(endless)
+        assert again.reached(lambda c: len(c.processes()) > 2, STARTED_S), again.output()
+        said = again.stop(signal.SIGTERM, False).error
+        assert "resumes: 2 finished parts of the crossing were crossed on 20" in said
 
 
 def test_a_worker_ends_with_the_process_that_started_it() -> None:
@@ -104,13 +69,12 @@ def test_a_worker_ends_with_the_process_that_started_it() -> None:
         "    with Processes(2) as pool:\n"
         "        print(pool.submit(os.getpid)(), flush=True); pool.submit(time.sleep, 600)()"
     )
-    parent = subprocess.Popen(
-        [sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True, start_new_session=True
-    )
+    parent = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None and parent.stdout.readline()
+    workers = psutil.Process(parent.pid).children(recursive=True)
     parent.kill()
     parent.communicate()
-    assert wait_for(lambda: not of_session(parent.pid), 10)
+    assert len(workers) >= 2 and not psutil.wait_procs(workers, 10)[1]
 
 
 def test_an_exception_does_not_wait_for_what_is_under_way() -> None:
