@@ -3,8 +3,8 @@
 Each kill is SIGKILL to the whole process group of an ingest, a training, a promotion, a scheduled retraining or a
 compensation on a small machine; every second time also to processes that have a group of their own, as in a power cut.
 Then the lake has to be whole, `status` has to work, the same command again has to
-succeed with the numbers of an undisturbed run, and the registry has to have no half-made version. OUT/kills.jsonl has a
-line per kill, OUT/chaos.json the tables; the same call goes on where it was stopped.
+succeed with the numbers of an undisturbed run, and the registry has to have no half-made version. Each kill prints a
+line; the home after one that broke something stays in OUT.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -59,6 +59,7 @@ class Work:
         self.out, self.home = out.resolve(), out.resolve() / "home"
         self.out.mkdir(parents=True, exist_ok=True)
         self.machine, self.recordings, self.first = (self.out / n for n in ("m.yml", "in", "first"))
+        self.references: dict[tuple[str, str], tuple[float, dict[str, Any]]] = {}
         if not self.machine.exists():
             write_year(self.recordings, BATCHES)
             (self.recordings / "20251214.csv").write_bytes(b"")  # goes to quarantine
@@ -190,13 +191,11 @@ class Kill:
     """One kill: `moment_s` after the start, `share` of an undisturbed run's time, `phase` the last line before it."""
 
     command: str
-    number: int
     template: str
     moment_s: float
     share: float
     phase: str
-    broken: tuple[str, ...]
-    details: tuple[str, ...]
+    wrong: tuple[tuple[str, str], ...]  # invariants and what was seen
 
 
 def finished_trainings(home: Path) -> list[str]:
@@ -370,19 +369,16 @@ class Chaos:
 
     def reference(self, template: str) -> tuple[float, dict[str, Any]]:
         """Seconds and facts of an undisturbed run, measured once."""
-        file = self.work.out / f"reference-{self.key}-{template}.json"
-        if not file.exists():
+        if (self.key, template) not in self.work.references:
             self.work.renew(template)
             begun_s = time.monotonic()
             self.work.must(self.case.arguments(self.work), self.case.module)
             seconds = time.monotonic() - begun_s
             known = facts_of(self.work)
-            wrong = list(broken_now(known))
-            if wrong:
+            if wrong := list(broken_now(known)):
                 raise RuntimeError(f"an undisturbed {self.key} breaks invariants: {wrong}")
-            file.write_text(json.dumps([seconds, known]), encoding="utf-8")
-        seconds, known = json.loads(file.read_text(encoding="utf-8"))
-        return seconds, known
+            self.work.references[self.key, template] = seconds, known
+        return self.work.references[self.key, template]
 
     def kill(self, number: int) -> Kill:
         """One kill, and all that is seen after it."""
@@ -413,10 +409,7 @@ class Chaos:
         if kept == len(FAMILIES) and not resumed and self.key != "schedule":  # a scheduled run prints its summary alone
             wrong.append(("grid again", said[-400:]))
         phase = lines[-1][:80] if lines else "start"
-        return Kill(
-            self.key, number, template, round(moment_s, 2), round(moment_s / usual_s, 3), phase,
-            tuple(dict.fromkeys(k for k, _ in wrong)), tuple(f"{k}: {t}" for k, t in wrong),
-        )  # fmt: skip
+        return Kill(self.key, template, moment_s, moment_s / usual_s, phase, tuple(wrong))
 
     def _killed(
         self, template: str, usual_s: float, rng: random.Random, everything: bool
@@ -449,47 +442,26 @@ def summary(kills: Sequence[Kill]) -> list[dict[str, Any]]:
     rows = []
     for key in dict.fromkeys(k.command for k in kills):
         own = [k for k in kills if k.command == key]
-        names = [b for k in own for b in k.broken]
+        names = [name for k in own for name in dict.fromkeys(name for name, _ in k.wrong)]
         rows.append({
-            "command": key, "kills": len(own), "kills_with_a_broken_invariant": sum(bool(k.broken) for k in own),
+            "command": key, "kills": len(own), "kills_with_a_broken_invariant": sum(bool(k.wrong) for k in own),
             "broken": {name: names.count(name) for name in dict.fromkeys(names)},
-            "median_moment_s": statistics.median(k.moment_s for k in own),
-            "median_share": statistics.median(k.share for k in own),
+            "median_moment_s": round(statistics.median(k.moment_s for k in own), 2),
+            "median_share": round(statistics.median(k.share for k in own), 3),
         })  # fmt: skip
     return rows
 
 
-def read_kills(out: Path) -> list[Kill]:
-    file = out / "kills.jsonl"
-    lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
-    rows = [json.loads(line) for line in lines]
-    return [Kill(**{**r, "broken": tuple(r["broken"]), "details": tuple(r["details"])}) for r in rows]
-
-
 def run(out: Path, kills: int, seed: int, only: Sequence[str], say: Callable[[str], None] = print) -> list[Kill]:
-    """`kills` kills, spread over the commands in turn; those of an earlier call with this seed are not repeated."""
-    work = Work(out)
-    done = {(k.command, k.number) for k in read_kills(out)}
+    """`kills` kills, spread over the commands in turn."""
+    work, found = Work(out), []
     for n in range(kills):
         key, number = only[n % len(only)], n // len(only)
-        if (key, number) in done:
-            continue
-        kill = Chaos(work, key, seed).kill(number)
-        with (out / "kills.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(asdict(kill), ensure_ascii=False) + "\n")
-        if kill.broken:
-            kept = out / f"broken-{key}-{number}"
-            shutil.copytree(work.home, kept, dirs_exist_ok=True)
+        found.append(kill := Chaos(work, key, seed).kill(number))
+        if kill.wrong:
+            shutil.copytree(work.home, out / f"broken-{key}-{number}", dirs_exist_ok=True)
         say(f"{key} {number} ({kill.template}) at {kill.moment_s:.2f} s, {kill.phase!r}: "
-            f"{'; '.join(kill.details)[:500] or 'whole'}")  # fmt: skip
-    found = [k for k in read_kills(out) if k.command in only]
-    report = {
-        "schema": "thermodrift.chaos/1",
-        "seed": seed,
-        "commands": summary(found),
-        "kills": [asdict(k) for k in found],
-    }
-    (out / "chaos.json").write_text(json.dumps(report, indent=1, ensure_ascii=False), encoding="utf-8")
+            f"{'; '.join(map(': '.join, kill.wrong))[:500] or 'whole'}")  # fmt: skip
     return found
 
 
@@ -498,7 +470,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default=",".join(CASES))
-    parser.add_argument("--out", type=Path, default=ROOT / "var" / "chaos", help="work folder; kept between calls")
+    parser.add_argument("--out", type=Path, default=ROOT / "var" / "chaos", help="work folder")
     parser.add_argument("--table", type=Path, help="where a row for each command goes, such as results/kills.csv")
     parser.add_argument("--facts", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -519,7 +491,6 @@ def main() -> None:
         from benchmarks.results import write
 
         write(given.table, pd.DataFrame(rows).drop(columns="broken"), f"python -m tests.chaos --table {given.table}")
-    sys.exit(0)
 
 
 if __name__ == "__main__":

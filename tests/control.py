@@ -4,8 +4,8 @@ A stream is a life of a toy machine in simulated time: the loop of the compensat
 repeated, stamped ahead or behind, not numbers, frozen, stepped or of exchanged sensors, while clocks are set, the
 process ends or is killed and starts again, and the receiver of an export moves what arrives. A kill ends the command
 `compensate` in real time, by SIGKILL, SIGTERM or the end of its input, and starts it again at the same receiver.
-The receiver is the C that the export writes, where gcc is installed, else its core in Python. OUT/loops.jsonl has a
-line per stream and kill; the same call goes on where it was stopped.
+The receiver is the C that the export writes, where gcc is installed, else its core in Python. Each kill prints a line,
+and each stream that breaks something.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -232,32 +232,22 @@ def kills(numbers: Sequence[int], folder: Path, seed: int, keep: Callable[[Loop]
 # ----- the command
 
 
-def read_loops(out: Path) -> list[Loop]:
-    file = out / "loops.jsonl"
-    rows = map(json.loads, file.read_text(encoding="utf-8").splitlines()) if file.exists() else ()
-    return [Loop(**{**row, "broken": tuple(row["broken"])}) for row in rows]
-
-
-def run(
-    out: Path, streams: int, count: int, seed: int, say: Callable[[str], None] = print,
-) -> list[Loop]:  # fmt: skip
-    """So many streams and kills; those of an earlier call with this folder are not repeated."""
+def run(out: Path, streams: int, count: int, seed: int, say: Callable[[str], None] = print) -> list[Loop]:
+    """So many streams and kills."""
     out.mkdir(parents=True, exist_ok=True)
-    known = {(loop.what == "stream", loop.number) for loop in read_loops(out)}
+    found: list[Loop] = []
 
     def keep(loop: Loop) -> None:
-        with (out / "loops.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(asdict(loop), ensure_ascii=False) + "\n")
+        found.append(loop)
         if loop.broken or loop.what != "stream":
             say(f"{loop.what} {loop.number}: {'; '.join(loop.broken)[:500] or 'nothing broken'}")
 
-    if due := [k for k in range(count) if (False, k) not in known]:
-        kills(due, out / "kills", seed, keep)
+    if count:
+        kills(range(count), out / "kills", seed, keep)
     at_control = receiver(LIMITS, out / "streams")
     for number in range(streams):
-        if (True, number) not in known:
-            keep(Stream(number, seed, at_control).run())
-    return read_loops(out)
+        keep(Stream(number, seed, at_control).run())
+    return found
 
 
 def summary(loops: Sequence[Loop]) -> list[dict[str, Any]]:
@@ -285,7 +275,7 @@ def main() -> None:
     parser.add_argument("--streams", type=int, default=10_000)
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=ROOT / "var" / "control", help="work folder; kept between calls")
+    parser.add_argument("--out", type=Path, default=ROOT / "var" / "control", help="work folder")
     parser.add_argument("--table", type=Path, help="where the rows go, such as results/control.csv")
     given = parser.parse_args()
     rows = summary(run(given.out.resolve(), given.streams, given.kills, given.seed))

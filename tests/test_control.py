@@ -17,13 +17,12 @@ from tests.compensation.test_any_order import InMemory
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc to compile the receiver")
 
 
-def test_hostile_streams_break_nothing_and_a_second_call_goes_on(tmp_path: Path) -> None:
+def test_hostile_streams_break_nothing(tmp_path: Path) -> None:
     loops = control.run(tmp_path, 60, 0, 1)
     assert [loop.broken for loop in loops] == [()] * 60
     (row,) = control.summary(loops)
     assert row["active_samples"] > 0.3 * row["samples"] and row["restarts"] > 60
     assert row["largest_step_of_limit"] == pytest.approx(1.0)  # the limits are reached, so that they are tried
-    assert control.run(tmp_path, 61, 0, 1)[:60] == loops
 
 
 @needs_gcc
