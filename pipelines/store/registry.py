@@ -47,6 +47,7 @@ from pipelines.store.audit import CHAMPION, PROVISIONAL
 from pipelines.store.runs import (
     close_interrupted,
     code_version,
+    mark_champion,
     model_versions,
     registered_models,
     standing_versions,
@@ -364,6 +365,7 @@ def rollback(name: str, settings: Settings, reason: str = "", of: int | None = N
             summary = f"{name}: champion is version {back.version} again; version {champion} was rolled back"
             present, rejected = back, champion
         client.set_model_version_tag(name, str(rejected), "rolled_back", "true")
+        mark_champion(client, present.tags.get("training_id", ""), str(present.version))
         return _back(present, summary)
 
 
@@ -553,6 +555,7 @@ def _crown(client: MlflowClient, name: str, version: str, why: str, training_id:
         client, name, version, action="promote", why=why, training_id=training_id, code_version=code_version(),
         forced=forced,
     )  # fmt: skip
+    mark_champion(client, training_id, version)
     _drop(client, name, CHALLENGER, PROVISIONAL)  # lost to an older champion, and stood in for one
 
 

@@ -27,6 +27,7 @@ import pandas as pd
 import psutil
 from mlflow.entities import Dataset, DatasetInput, Experiment, InputTag, Metric, Param, Run, RunStatus, RunTag
 from mlflow.entities.model_registry import ModelVersion, RegisteredModel
+from mlflow.exceptions import MlflowException
 from mlflow.tracking import MlflowClient
 from pydantic import BaseModel, ConfigDict
 
@@ -42,6 +43,8 @@ _SAME_START_S = 30.0  # the clock may be set while a process runs; no number of 
 _PROGRAM = "thermodrift"
 DIAGNOSIS = "diagnosis"  # in the place of the error channel
 _NOTE, _SHARED, _VIEW = "mlflow.note.content", "mlflow.sharedViewState.", "trainings"
+_OF_CELL = ("family", "n_tsp", "selector")
+_NAME, _STAR = "mlflow.runName", "★ "  # the star marks the training that the champion is of
 
 
 class Entity(BaseModel):
@@ -179,22 +182,48 @@ def find_experiment(client: MlflowClient, settings: Settings, machine: str, targ
 def _page(experiment: str, machine: str, target: str) -> dict[str, str]:
     """How MLflow's page shows an experiment: as trainings, with a note that leads to the list with the right columns.
 
-    By itself the list has no column of a metric. `viewStateShareKey` names a view that is kept with the experiment.
+    By itself the list has no column of a metric, and room for 17 characters of a run's name. `viewStateShareKey` names
+    a view that is kept with the experiment.
     """
-    metrics = ("score_um", "S_mean_um", "S_std_um", "max_um", "n_tsp", "nested_S_mean_um", "expected_S_um")
-    columns = [
-        *(f"metrics.`{m}`" for m in metrics),
-        *(f"params.`{p}`" for p in ("family", "selector")), "tags.`outcome`",
-    ]  # fmt: skip
+    metrics = ("S_mean_um", "S_std_um", "expected_S_um", "expected_S_bound90_um", "max_um", "score_um")
+    columns = ["tags.`outcome`", *(f"metrics.`{m}`" for m in metrics), *(f"params.`{p}`" for p in _OF_CELL)]
     view = {
-        "orderByKey": "attributes.start_time",
-        "orderByAsc": False,
-        "selectedColumns": ["attributes.`Source`", *columns],
-    }
-    about = f"Thermal error {target} of {machine}"
-    note = f"{about}. [Compare trainings](#/experiments/{experiment}/runs?viewStateShareKey={_VIEW})"
+        "orderByKey": "attributes.start_time", "orderByAsc": False, "selectedColumns": columns,
+        "columnOrder": ["attributes.`Run Name`", "runDateAndNestInfo", *columns, "duration"],
+        "columnWidths": {
+            "attributes.`Run Name`": 330, "metrics.`expected_S_um`": 125, "metrics.`expected_S_bound90_um`": 180,
+        },
+    }  # fmt: skip
+    note = _note(experiment, machine, target)
     tags = {"mlflow.experimentKind": "custom_model_development", _NOTE: note, _SHARED + _VIEW: json.dumps(view)}
     return tags if target != DIAGNOSIS else {**tags, _NOTE: f"Diagnoses of {machine}", _SHARED + _VIEW: "{}"}
+
+
+def _note(experiment: str, machine: str, target: str, champion: str = "") -> str:
+    link = f"#/experiments/{experiment}/runs?viewStateShareKey={_VIEW}&workflowType=machine_learning"
+    return f"Thermal error {target} of {machine}. {champion}[Compare trainings]({link})"
+
+
+def mark_champion(client: MlflowClient, training_id: str, version: str) -> None:
+    """Show in MLflow's pages which training the champion is of: a star before its name, and a line in the note.
+
+    A note that a user wrote stays as it is.
+    """
+    try:
+        run = client.get_run(training_id)
+    except MlflowException as error:
+        if error.error_code not in ("RESOURCE_DOES_NOT_EXIST", "INVALID_PARAMETER_VALUE"):
+            raise
+        return  # the training is deleted for good; its version may still be champion
+    experiment = client.get_experiment(run.info.experiment_id)
+    for other in client.search_runs([run.info.experiment_id], f"attributes.run_name LIKE '{_STAR}%'"):
+        client.set_tag(other.info.run_id, _NAME, str(other.info.run_name).removeprefix(_STAR))
+    name = str(run.info.run_name).removeprefix(_STAR)
+    client.set_tag(training_id, _NAME, _STAR + name)
+    if f"viewStateShareKey={_VIEW}" in experiment.tags.get(_NOTE, ""):
+        machine, target = (experiment.tags[k] for k in ("machine", "target"))
+        note = _note(run.info.experiment_id, machine, target, f"{_STAR}Champion: version {version}, {name}. ")
+        client.set_experiment_tag(run.info.experiment_id, _NOTE, note)
 
 
 def artifact_folder(machine: str, target: str) -> str:

@@ -33,6 +33,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from data.batch import Batch
 from data.errors import InputError, WorkError, place_of
 from data.files import from_json
+from data.units import unit_label
 from models.families import FAMILIES
 from models.protocols import PromotionRule
 from models.selection.outlook import outlook
@@ -56,6 +57,7 @@ from pipelines.store.runs import (
     write_record,
     yes_or_no,
 )
+from reports.labels import three_digits
 
 if TYPE_CHECKING:
     from diagnosis.result import Diagnosis
@@ -178,7 +180,9 @@ def training_record(
     if rule.offered(set(result.cells["protocol"])):
         best = choice or choose(result, rule)
         expected = outlook(result, best)
-        name += f" {best.family} {best.n_tsp} {best.selector}"
+        unit = unit_label(plain.get("unit", "um"))
+        name = f"{three_digits(best.S_mean_um)} ± {three_digits(best.S_std_um)} {unit} "
+        name += f"{best.family} {best.n_tsp} {best.selector}"  # MLflow's list shows the begin of a name
         metrics |= _cell_metrics(_judged_row(result, rule, best)) | {
             "nested_S_mean_um": best.nested_S_mean_um, "nested_S_std_um": best.nested_S_std_um,
             "expected_S_um": expected.S_um, "expected_S_bound90_um": expected.bound_um,

@@ -152,10 +152,20 @@ def test_by_force(store):
 def test_roll_back_goes_to_the_version_before_and_no_further(store):
     train(store, "toy-back", [5.0, 6.0, 5.0, 6.0, 5.0, 6.0])
     train(store, "toy-back", [4.0, 5.0, 4.0, 5.0, 4.0, 5.0, 4.0])
+    client = client_of(store)
+    experiment = client.get_experiment_by_name("toy-back z").experiment_id
+
+    def shown() -> tuple[list[bool], str]:
+        """Which trainings have the star of the champion in MLflow's list, the newest first, and the note's claim."""
+        runs = client.search_runs([experiment], "tags.kind = 'training'")
+        note = client.get_experiment(experiment).tags["mlflow.note.content"]
+        return [r.info.run_name.startswith("★ ") for r in runs], note.partition(". ")[2].partition(",")[0]
+
+    assert shown() == ([True, False], "★ Champion: version 2")
     back = registry.rollback("toy-back-z", store)
     assert back.version == 1
     assert aliases(store, "toy-back-z")["champion"] == 1
-    client = client_of(store)
+    assert shown() == ([False, True], "★ Champion: version 1")
     assert client.get_model_version("toy-back-z", "2").tags["rolled_back"] == "true"
     ends = registry.status(store).set_index(["name", "version"]).loc["toy-back-z", "was_champion_until"]
     assert ends[2] and not ends[1]
