@@ -19,7 +19,6 @@ from reports.labels import count, digits_of, number
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from diagnosis.findings.schema import Finding
     from diagnosis.result import Diagnosis
     from pipelines.jobs.diagnosing import DiagnosisOutcome
 
@@ -93,26 +92,13 @@ def print_diagnosis(outcome: DiagnosisOutcome) -> None:
 
 
 def sentences(d: Diagnosis) -> list[str]:
-    """A sentence a finding with its probability, numbered; without any, what the verdict means here."""
-    from reports.diagnosis.first_screen import limits_sentence, shortened
-    from reports.diagnosis.tables import below_headline
+    """A line a finding with its probability, numbered; without any, what the verdict means here."""
+    from reports.diagnosis.first_screen import claim, without_finding
+    from reports.diagnosis.tables import NARROW
 
-    f = d.findings
-    if f.findings:
-        return [f"{k}. {_with_probability(x)}" for k, x in enumerate(f.findings, 1)]
-    lead = f.statement or below_headline(f.verdict, f.fit.batches, len(d.tables["limits"]))
-    limits = limits_sentence(f.detection_limits) if f.verdict == "consistent" else ""
-    return [text for text in (shortened(lead), limits) if text]
-
-
-def _with_probability(x: Finding) -> str:
-    """The statement; an unsure one states its probability itself."""
-    from reports.diagnosis.first_screen import shortened
-    from reports.diagnosis.tables import NARROW, probability_label
-
-    percent = probability_label(x.probability).replace(NARROW, " ")
-    said = shortened(x.statement)
-    return said if percent in said else f"{said} ({percent})"
+    claims = [claim(x) for x in d.findings.findings]
+    said = [f"{k}. {sure}: {text}".replace(NARROW, " ") for k, (sure, text) in enumerate(claims, 1)]
+    return said or [without_finding(d.findings)]
 
 
 def error_table(d: Diagnosis) -> Table:

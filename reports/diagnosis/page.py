@@ -8,11 +8,10 @@ from typing import Any
 
 import pandas as pd
 
-from diagnosis.findings.schema import Finding
 from diagnosis.result import Diagnosis
 from reports.diagnosis import tables
 from reports.diagnosis.figures import left_out_run, probabilities
-from reports.diagnosis.first_screen import Continued, Unsealed, limits_sentence, shortened
+from reports.diagnosis.first_screen import Continued, claim, without_finding
 from reports.diagnosis.map import Mark, mismatch_picture
 from reports.diagnosis.tables import by_change, by_channel, chosen_channels, mismatch, most_changed
 from reports.drawing import picture
@@ -33,7 +32,7 @@ def write_diagnosis_report(
     path: Path,
     d: Diagnosis,
     pictures: bool = True,
-    unsealed: Unsealed | None = None,
+    above: Group | None = None,
     continued: Continued | None = None,
 ) -> None:
     """Write the page. It is self-contained; it appears whole or not at all.
@@ -41,17 +40,17 @@ def write_diagnosis_report(
     Without `pictures` the tables and text alone.
 
     Args:
-        unsealed: a demonstration's panel, above everything else.
+        above: stands above everything else, as the panel of a demonstration does.
         continued: the diagnosis that this one continues; the page says what changed.
 
     Raises:
         InputError: another suffix than .html, or a place that cannot be written.
     """
-    write_page(Path(path), diagnosis_page(d, pictures, unsealed, continued), (".html",))
+    write_page(Path(path), diagnosis_page(d, pictures, above, continued), (".html",))
 
 
 def diagnosis_page(
-    d: Diagnosis, pictures: bool = True, unsealed: Unsealed | None = None, continued: Continued | None = None
+    d: Diagnosis, pictures: bool = True, above: Group | None = None, continued: Continued | None = None
 ) -> Page:
     """The page; whatever table is empty leaves its part out."""
     f, t, changed = d.findings, d.tables, bool(d.findings.findings)
@@ -64,7 +63,7 @@ def diagnosis_page(
         Details("What a laboratory can check", _checks(d)),
     )
     written = "findings.json"
-    if f.findings and unsealed is None:
+    if f.findings and above is None:
         written += "; the machine file with what was found: machine.yml"
     seconds = "" if f.seconds is None else f" {sentence(f'{tables.seconds_label(f.seconds)} of computing')}"
     chip = tables.CHIPS[f.verdict]
@@ -80,7 +79,7 @@ def diagnosis_page(
         d.simulated,
         tables.headline(f.verdict, [x.probability for x in f.findings], tables.most_left(f.fit.left_out_rms)),
         (chip, f.verdict),
-        above=() if unsealed is None else (unsealed.panel(errors, changed),),
+        above=given(above),
     )
 
 
@@ -88,12 +87,11 @@ def _sentences(d: Diagnosis, errors: Sequence[str], continued: Continued | None)
     """What was found, how sure, and how much better left-out runs are predicted; what it rests on, what comes next."""
     f = d.findings
     if f.findings:
-        leads = [_claim(k, x) for k, x in enumerate(f.findings, 1)]
+        claims = [claim(x) for x in f.findings]
+        leads = [Text(text, "lead", f"{k}. {sure}:") for k, (sure, text) in enumerate(claims, 1)]
         better = f"{f.fit.batches_improved} of {count(f.fit.batches, 'left-out run')} are predicted better"
     else:
-        said = shortened(f.statement or tables.below_headline(f.verdict, f.fit.batches, bool(len(d.tables["limits"]))))
-        limits = limits_sentence(f.detection_limits) if f.verdict == "consistent" else ""
-        leads = [Text(f"{said} {limits}".strip(), "lead")]
+        leads = [Text(without_finding(f), "lead")]
         better = f"{count(f.fit.batches, 'left-out run')}, each predicted from the others"
     news = () if continued is None else tuple(continued.sentences(f))
     run = f.next_experiment
@@ -110,12 +108,6 @@ def _sentences(d: Diagnosis, errors: Sequence[str], continued: Continued | None)
         ),
         Items(tuple(d.remarks), "remarks"),
     )  # fmt: skip
-
-
-def _claim(k: int, x: Finding) -> Text:
-    said, chance = shortened(x.statement), tables.probability_label(x.probability)
-    stated = chance.replace(tables.NARROW, " ") in said  # by the statement of an unsure finding
-    return Text(said, "lead", f"{k}." if stated else f"{k}. {chance}, {tables.likelihood(x.probability)}:")
 
 
 def _pictures(d: Diagnosis) -> Iterator[Any]:
@@ -202,9 +194,11 @@ def _checks(d: Diagnosis) -> tuple[Any, ...]:
     t, f = d.tables, d.findings
     laws: list[Any] = []
     for k, x in enumerate(f.findings, 1):
-        laws += [Heading(f"{k}. {tables.effect_label(x)}, {x.when.regime}"), Text(x.equation, "law")]
+        head = Heading(f"{k}. {tables.effect_label(x)}, {x.when.regime}")
+        laws += [head, Text(x.statement), Text(x.equation, "law")]
     account = tables.account_table(f.account)
     return given(
+        Text(f.statement),
         *laws,
         tables.parameters(f.findings) if any(x.parameters for x in f.findings) else None,
         tables.runs(t["rms"], bool(f.findings)) if len(t["rms"]) else None,

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from data.units import unit_label
 from diagnosis.findings.schema import Alternative, Finding, LeftOutRms, NextExperiment
 from diagnosis.policy import POLICY
-from reports.labels import NOTHING, count, digits_of, number, percent, three_digits
+from reports.labels import NOTHING, digits_of, number, percent, three_digits
 from reports.layout import Column, Row, Table
 from reports.twin.tables import quantity
 
@@ -105,14 +105,6 @@ def headline(verdict: str, probabilities: Sequence[float], left: str = "") -> st
         "unlisted": "Something is missing that no listed mechanism explains.",
         "undecidable": "Something is missing, but these recordings do not show what.",
     }[verdict]
-
-
-def below_headline(verdict: str, runs: int, limits: int) -> str:
-    """One sentence where a verdict has no finding to speak for it."""
-    if verdict != "consistent":
-        return ""
-    text = f"In {count(runs, 'left-out run')} the simulation misses no more than noise and a coarse network leave"
-    return text + ("; an effect above the limits below would be claimed." if limits else ".")
 
 
 def mechanism_label(key: str) -> str:
@@ -322,18 +314,12 @@ def by_channel(rms: pd.DataFrame) -> pd.DataFrame:
     Args:
         rms: the diagnosis' table of left-out rms by batch and channel.
     """
-    out = []
-    for channel, part in rms.groupby("channel", sort=False):
-        rows = part["rows"].to_numpy(float)
-        kept = rows > 0
-        square = [
-            float(np.sqrt(np.average(part[k].to_numpy(float)[kept] ** 2, weights=rows[kept]))) if kept.any() else np.nan
-            for k in ("before", "after", "floor")
-        ]
-        improved = int((part["after"] < part["before"]).sum())
-        out.append((channel, part["unit"].iloc[0], int(rows.sum()), *square, len(part), improved))
-    columns = ["channel", "unit", "rows", "before", "after", "floor", "batches", "improved"]
-    return pd.DataFrame(out, columns=columns)
+    kinds = ["before", "after", "floor"]
+    square = rms[kinds].pow(2).mul(rms["rows"], axis=0)
+    groups = rms.assign(batches=1, improved=rms["after"] < rms["before"], **square).groupby("channel", sort=False)
+    out = groups[["rows", *kinds, "batches", "improved"]].sum()
+    out[kinds] = np.sqrt(out[kinds].div(out["rows"].replace(0, np.nan), axis=0))
+    return out.assign(unit=groups["unit"].first()).reset_index()
 
 
 def by_change(channels: pd.DataFrame) -> pd.DataFrame:

@@ -16,6 +16,7 @@ from data.machine import load_machine
 from diagnosis.findings.schema import read_findings
 from diagnosis.result import Diagnosis
 from pipelines.jobs import diagnosing
+from reports.diagnosis.first_screen import claim
 from tests.toys.command import Call, Done, in_process
 from tests.toys.diagnoser import NOTE, PLAN, Toy, write_machine, write_recordings
 from tests.toys.diagnosis import toy_diagnosis
@@ -83,7 +84,7 @@ def test_a_finding_becomes_files_and_sentences(diagnose: Diagnosed, toy: Toy, gi
     lines = done.out.splitlines()
     assert lines[0] == f"{NAME}: diagnosis of 3 batches  (simulated recordings)"
     assert lines[1] == "The simulation left out one effect; with it noise alone is left."
-    assert lines[2].startswith("1. The bed loses heat to the floor, 10.2 W/K") and lines[2].endswith("(97 %)")
+    assert lines[2].startswith("1. 97 %, extremely likely: heat to the floor at bed, conductance 10.2 W/K (90 %: ")
     z = next(line.split() for line in lines if line.split()[:2] == ["z", "µm"])
     rms = found.fit.left_out_rms
     assert z[2] == "12" and float(z[3]) == pytest.approx(rms.before["z_um"], abs=0.06)
@@ -124,12 +125,10 @@ def test_json_is_one_document(diagnose: Diagnosed, toy: Toy, tmp_path: Path) -> 
 
 def test_the_next_run_is_told(diagnose: Diagnosed, toy: Toy, tmp_path: Path) -> None:
     toy.verdict = "undecidable"
-    said = toy_diagnosis("undecidable").findings.findings[0]
-    named = said.model_copy(update={"statement": f"Perhaps (52 %) {said.statement}"})
-    toy.change = lambda d: replace(d, findings=d.findings.model_copy(update={"findings": (named,)}))
     lines = diagnose("--no-report").out.splitlines()
-    verdict = ["Something is missing, but these recordings do not show what.", f"1. {named.statement}"]
-    assert lines[1:3] == verdict  # the sentence says its probability itself
+    text = claim(toy_diagnosis("undecidable").findings.findings[0])[1]
+    verdict = "Something is missing, but these recordings do not show what."
+    assert lines[1:3] == [verdict, f"1. 52 %, more likely than not: {text}"]
     run = next(line for line in lines if line.startswith("next run: "))
     assert run.startswith("next run: Night stop: 3 h of spindle at 4000 rpm, then everything off") and "; 12 h" in run
     assert "note: Fewer than 4 batches: no probability above 80 % is stated." in lines

@@ -19,7 +19,7 @@ from data.files import check_folder, write_atomic
 from data.machine import Machine, load_machine
 from diagnosis.findings.schema import Finding, as_json
 from diagnosis.result import Diagnosis
-from reports.diagnosis.first_screen import RIGHT, Outcome, Unsealed
+from reports.diagnosis import tables
 from reports.diagnosis.page import write_diagnosis_report
 from thermodrift_exam.plants.concealed import Case, conceal, write_case
 from thermodrift_exam.plants.real import SCHEMA
@@ -30,6 +30,7 @@ from thermodrift_exam.proof.sealing.folder import folder_digest, now, salted_dig
 from thermodrift_exam.proof.sealing.plain import from_plain
 from thermodrift_exam.proof.sealing.running import RUN, Examinee, examine, in_parallel
 from thermodrift_exam.proof.sealing.seal import SALT_BYTES, Done
+from thermodrift_exam.proof.unsealed import RIGHT, Outcome, Unsealed
 
 REPORT, PLAN, FINDINGS, SEALED, OPENED = "report.html", "next_run.yml", "findings.json", "sealed.json", "opened.json"
 CASE = "case"
@@ -49,7 +50,7 @@ class Seal:
 
 @dataclass(frozen=True)
 class Judgement:
-    """`outcome` as the page names it, in `reports.diagnosis.first_screen`.
+    """`outcome` as the page names it, in `thermodrift_exam.proof.unsealed`.
 
     `finding` is the finding that matches the concealed effect, None without a match; `false` are the false claims.
     """
@@ -197,7 +198,8 @@ def _emptied(out: Path) -> None:
 
 def _written(out: Path, d: Diagnosis, panel: Unsealed) -> dict[str, Path]:
     """The page and the plan of the next run; all files by name."""
-    write_diagnosis_report(out / REPORT, d, unsealed=panel)
+    changed = bool(d.findings.findings)
+    write_diagnosis_report(out / REPORT, d, above=panel.panel(tables.error_lines(d.tables["rms"], changed), changed))
     if d.plan_text is not None:
         write_atomic(out / PLAN, d.plan_text)
     names = (REPORT, FINDINGS, PLAN, SEALED, OPENED)
