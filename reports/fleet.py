@@ -8,8 +8,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from reports.labels import count
-from reports.layout import Cell, Column, Gauge, Number, Numbers, Page, Row, Section, Table, Text
+from reports.labels import count, family_label
+from reports.layout import Cell, Column, Gauge, Items, Page, Row, Section, Table, Text
 from reports.rendering import write_page
 
 _SCALE = 1.5  # of the drift strip: its end, in 90 % bounds
@@ -45,16 +45,12 @@ def fleet_page(
     alerted = {machine for machine, _, _ in alerts}
     without = sum(r["version"] is None for r in rows)
     failed = {r["machine"] for r in rows if r["last_run"] and not r["last_run"]["ok"]}
-    figures = (
-        Number("machines", str(len(machines)), f"{count(len(rows), 'channel')}"),
-        Number("with an alert", str(len(alerted)), count(len(alerts), "alert")),
-        Number("without a champion", str(without), "channels"),
-        Number("last retraining failed", str(len(failed)), "machines"),
-    )
     summary = (
         f"{count(len(alerts), 'alert')} on {len(alerted)} of {count(len(machines), 'machine')}."
         if alerts else f"No alert on {count(len(machines), 'machine')}."
     )  # fmt: skip
+    of = f"{count(len(rows), 'channel')}, {without or 'none'} without a champion"
+    of += f"; the last retraining of {count(len(failed), 'machine')} failed." if failed else "."
     unknown = tuple(f"{r['machine']} {r['channel']}: {r['unknown']}" for r in rows if r["unknown"])
     served = tuple(
         f"{f['source']}: {count(f['machines'], 'machine')}, {'served now' if f['served'] else 'not served now'}."
@@ -62,17 +58,16 @@ def fleet_page(
     )
     recorded = [r["simulated"] for r in rows if r["unknown"] != "nothing ingested"]
     simulated = bool(recorded) and all(recorded)
-    listed = Table("", _ALERTS, tuple(Row.of(*a) for a in alerts))
-    sections = [Section("alerts", "Alerts", (listed,))] if alerts else []
+    said = Items(tuple(f"{' '.join(filter(None, (machine, channel)))}: {why}" for machine, channel, why in alerts))
+    sections = [Section("alerts", "Alerts", (said,))] if alerts else []
     table = Table("", _COLUMNS, tuple(_row(r, now, simulated, pages) for r in rows), notes=(_NOTE,), look="stacked")
     sections.append(Section("fleet", "Machines and channels, worst first", (table,), "Machines and channels"))
     if unknown:
         sections.append(Section("unknown", "Not known", tuple(Text(said, "note") for said in unknown)))
-    top = (Text(summary), Numbers(figures))
+    top = (Text(summary, "lead"), Text(of))
     return Page("thermodrift status", f"Fleet: {summary}", top, tuple(sections), served, simulated, "Fleet")
 
 
-_ALERTS = (Column("machine"), Column("channel"), Column("alert", kind="wide"))
 _COLUMNS = (
     Column("machine, channel"), Column("champion"), Column("knows runs up to"), Column("error to expect, S"),
     Column("in newer runs, S"), Column("runs outside the trained region"), Column("failed sensors"),
@@ -91,10 +86,11 @@ def _row(r: Mapping[str, Any], now: datetime, simulated: bool, pages: Mapping[st
     stands_in, champion = r["provisional"] is not None, r["version"] is not None
     has = champion or stands_in
     state = "alert" if r["alerts"] else "ok" if champion else "none"
-    stands = Cell(f"v{r['version']} {r['family']}", _days(r["age_days"]))
+    family = family_label(r["family"]) if r["family"] else ""
+    stands = Cell(f"v{r['version']} {family}", _days(r["age_days"]))
     if not champion:
         lacking = f"v{r['provisional']} provisional" if stands_in else "none"
-        stands = Cell(lacking, "; ".join(filter(None, (r["family"], r["reason"]))))
+        stands = Cell(lacking, "; ".join(filter(None, (family, r["reason"]))))
     badge = "ok" if champion else "provisional" if stands_in else "no champion"
     label = count(len(r["alerts"]), "alert") if r["alerts"] else badge
     newer, bound = r["newer_S_mean_um"], r["bound90_S_um"]

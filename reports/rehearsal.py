@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from compensation.rehearsal import GAP_S, Rehearsal
-from reports.drawing import LINES, MUTED, WIDTH_IN, Picture, head, legend_row, panel, picture
-from reports.labels import GREEN, ORANGE
-from reports.layout import Column, Page, Row, Section, Table, Text, given
+from reports.drawing import LINES, MUTED, THIRD_IN, headed, panel
+from reports.labels import GREEN, ORANGE, count, listed
+from reports.layout import Column, Key, Page, Panel, Plot, Row, Section, Table, Text, given
 from reports.rendering import write_page
 from reports.viewer import Pane, Trace, viewer
 
 _MOST_POINTS = 1500  # of a line: more than there are pixels
-_TALL_IN, _GAP_IN = 2.1, 0.55
+_HALF_IN = 5.15  # of the page's width
 _STATES = {"off": "#d9dee3", "warm-up": "#cfe3f2", "active": GREEN, "hold": "#e9b44c", "fade-out": ORANGE}
 
 
@@ -33,26 +33,22 @@ def write_rehearsal(path: Path, r: Rehearsal, model: str, used: str) -> None:
 
 
 def rehearsal_page(r: Rehearsal, model: str, used: str) -> Page:
-    """The page."""
-    axes = list(r.before_um)
-    parts = []
-    for a in axes:
-        before, after = r.band_um(a)
-        parts.append(f"{a}: {before:.1f} to {after:.1f} µm")
-    failed = f", {len(r.failures)} failing sensor{'s' if len(r.failures) > 1 else ''}" if r.failures else ""
-    summary = (
-        f"Width of the band that holds 95 % of the rows, without and with compensation: {'; '.join(parts)}. "
-        f"{model} answered {len(r.time_s)} samples of {len(r.starts_s)} recordings{failed}. Of the recordings: {used}."
-    )
-    every = viewer("Error and correction, run by run", [p for a in axes for p in _panes(r, a)], r.simulated)
-    blocks = given(*(_picture(r, a) for a in axes), _table(r), every, _events(r).folded())
+    """The page, the axis with the largest error first."""
+    axes = sorted(r.before_um, key=lambda a: -r.band_um(a)[0])
+    bands = ((a, *r.band_um(a)) for a in axes)
+    said = listed([f"{after:.1f} µm in {a} ({before:.1f} µm without)" for a, before, after in bands])
+    failed = f", {count(len(r.failures), 'failing sensor')}" if r.failures else ""
+    note = f"{len(r.time_s)} samples of {count(len(r.starts_s), 'recording')}{failed}; {used}. Answered by {model}."
+    top = (Text(f"With compensation 95 % of the rows lie in a band of {said}.", "lead"), Text(note, "note"))
+    every = viewer("Error and correction, run by run", [p for a in axes for p in _panes(r, a)], simulated=False)
+    blocks = given(_table(r, axes), _pictures(r, axes), every, _events(r).folded())
     footer = (
         "The correction never acts on the temperatures, so the recorded error plus the correction is what a "
         "compensated machine would have shown.",
     )
     title = f"{r.machine}: rehearsal of the compensation"
     sections = (Section("rehearsal", "", blocks),)
-    return Page("thermodrift compensation", title, (Text(summary),), sections, footer, r.simulated)
+    return Page("thermodrift compensation", title, top, sections, footer, r.simulated)
 
 
 def _panes(r: Rehearsal, axis: str) -> list[Pane]:
@@ -70,14 +66,14 @@ def _panes(r: Rehearsal, axis: str) -> list[Pane]:
     return panes
 
 
-def _table(r: Rehearsal) -> Table:
+def _table(r: Rehearsal, axes: Sequence[str]) -> Table:
     columns = (
         Column("axis"), Column("band before", "µm", "number"), Column("band after", "µm", "number"),
         Column("rms before", "µm", "number"), Column("rms after", "µm", "number"), Column("active", "%", "number"),
         Column("fastest change sent", "µm/s", "number"),
     )  # fmt: skip
     rows = []
-    for a in r.before_um:
+    for a in axes:
         apart_s = np.diff(r.time_s)
         within = apart_s < GAP_S  # a night between two recordings is no change
         rates = np.abs(np.diff(r.sent_um[a]))[within] / apart_s[within]
@@ -86,7 +82,7 @@ def _table(r: Rehearsal) -> Table:
         cells = (*(f"{v:.2f}" for v in (*band, *rms)), f"{active:.0f}", f"{fastest:.2f}")
         rows.append(Row.of(a, *cells))
     note = "The band holds 95 % of the rows; rms is about 0, the error at each recording's start."
-    return Table("Error without and with compensation", columns, tuple(rows), r.simulated, notes=(note,))
+    return Table("Error without and with compensation", columns, tuple(rows), notes=(note,), look="stacked")
 
 
 def _events(r: Rehearsal) -> Table:
@@ -100,35 +96,45 @@ def _events(r: Rehearsal) -> Table:
                 was = state
     columns = (Column("time", "h", "number"), Column("axis"), Column("state"), Column("reason", kind="wide"))
     notes = (f"{len(r.readings_s)} readings of a probe.",) if r.readings_s else ()
-    return Table("Changes of state", columns, tuple(rows), r.simulated, notes=notes)
+    return Table("Changes of state", columns, tuple(rows), notes=notes)
 
 
-def _picture(r: Rehearsal, axis: str) -> Picture:
-    tall = 0.95 + 2 * _TALL_IN + _GAP_IN
-    fig = Figure(figsize=(WIDTH_IN, tall + 0.3))
-    head(fig, f"{axis}: error and correction", r.simulated)
-    entries = [("—", "without compensation", MUTED), ("—", "with compensation", LINES[0]), ("—", "sent", LINES[2])]
-    if r.readings_s:
-        entries.append(("▲", "reading", LINES[1]))
-    if r.failures:
-        entries.append(("■", "sensor fails", ORANGE))
-    legend_row(fig, entries, 0.12, 0.48)
-    upper = panel(fig, 0.75, 0.75, WIDTH_IN - 0.95, _TALL_IN)
-    lower = panel(fig, 0.75, 0.75 + _TALL_IN + _GAP_IN, WIDTH_IN - 0.95, _TALL_IN)
-    _lines(upper, r, [(r.before_um[axis], MUTED, 1.0), (r.after_um[axis], LINES[0], 1.3)])
-    _lines(lower, r, [(r.sent_um[axis], LINES[2], 1.3)])
-    upper.set_ylabel("error, µm", fontsize=8.5, color=MUTED)
-    lower.set_ylabel("sent, µm", fontsize=8.5, color=MUTED)
-    lower.set_xlabel("time, h (nights are cut to one hour)", fontsize=8.5, color=MUTED)
+def _pictures(r: Rehearsal, axes: Sequence[str]) -> Panel:
+    """Error and correction of every axis, with the states of the compensation between."""
+    wide_in = THIRD_IN if len(axes) > 2 else _HALF_IN
+    plots = [Plot(_figure(r, a, wide_in), f"Error and correction of {a} in the rehearsal", "third") for a in axes]
+    keys = [Key("without compensation", MUTED), Key("with compensation", LINES[0]), Key("sent", LINES[2])]
+    keys += [Key("reading", LINES[1], "triangle-up", alone=True)] if r.readings_s else []
+    keys += [Key("sensor fails", _FAILING, "square", alone=True)] if r.failures else []
+    seen = {state for a in axes for state in r.state[a]}
+    keys += [Key(state, color, "square", alone=True) for state, color in _STATES.items() if state in seen]
+    return Panel("Error and correction; nights are cut to one hour", tuple(plots), keys=tuple(keys))
+
+
+_FAILING = "#fadfd0"
+
+
+def _figure(r: Rehearsal, axis: str, wide_in: float) -> Figure:
+    fig = Figure(figsize=(wide_in, 3.0))
+    headed(fig, axis, r.simulated)
+    upper = panel(fig, 0.52, 0.32, wide_in - 0.6, 1.2)
+    lower = panel(fig, 0.52, 1.85, wide_in - 0.6, 0.75)
+    _lines(upper, r, [(r.before_um[axis], MUTED, 0.9), (r.after_um[axis], LINES[0], 1.2)])
+    _lines(lower, r, [(r.sent_um[axis], LINES[2], 1.2)])
+    upper.tick_params(labelbottom=False)
+    upper.set_ylabel("error, µm", fontsize=8, color=MUTED)
+    lower.set_ylabel("sent, µm", fontsize=8, color=MUTED)
+    lower.set_xlabel("time, h", fontsize=8, color=MUTED, labelpad=2)
+    fig.align_ylabels()
     low = upper.get_ylim()[0]
-    upper.plot(np.array(r.readings_s) / 3600, np.full(len(r.readings_s), low), "^", color=LINES[1], ms=4, clip_on=False)
+    upper.plot(np.array(r.readings_s) / 3600, np.full(len(r.readings_s), low), "^", color=LINES[1], ms=3, clip_on=False)
     for f in r.failures:
         for ax in (upper, lower):
-            ax.axvspan(f.start_s / 3600, f.end_s / 3600, color=ORANGE, alpha=0.16, lw=0)
-        upper.annotate(f"{f.channel} {f.how}", (f.start_s / 3600, 1.0), xycoords=("data", "axes fraction"),
-                       fontsize=7.5, color=ORANGE, va="bottom")  # fmt: skip
+            ax.axvspan(f.start_s / 3600, f.end_s / 3600, color=_FAILING, lw=0, zorder=0)
+        upper.text(f.start_s / 3600, -0.05, f"{f.channel} {f.how}", transform=upper.get_xaxis_transform(),
+                   fontsize=6.5, color=ORANGE, va="top")  # fmt: skip
     _states(lower, r, axis)
-    return picture(fig, f"Error and correction of {axis} in the rehearsal", r.simulated, look="full")
+    return fig
 
 
 def _lines(ax: Axes, r: Rehearsal, lines: list[tuple[NDArray[np.float64], str, float]]) -> None:
@@ -140,21 +146,13 @@ def _lines(ax: Axes, r: Rehearsal, lines: list[tuple[NDArray[np.float64], str, f
         for rows in np.split(np.arange(len(time_h)), breaks):
             ax.plot(time_h[rows][::every], values[rows][::every], color=color, lw=width)
     ax.set_xlim(0, float(time_h[-1]))
+    ax.locator_params(axis="y", nbins=5)
     ax.axhline(0.0, color=MUTED, lw=0.6)
 
 
 def _states(ax: Axes, r: Rehearsal, axis: str) -> None:
-    """A strip above the axes that shows the state, with each state's name where it is wide enough."""
+    """A strip above the axes in the colours of the states."""
     time_h, states = r.time_s / 3600, np.array(r.state[axis])
     changes = [0, *(np.flatnonzero((states[1:] != states[:-1]) | (np.diff(time_h) > 0.5)) + 1), len(states)]
-    whole = float(time_h[-1])
     for a, b in pairwise(changes):
-        begin, end = time_h[a] / whole, time_h[b - 1] / whole
-        ax.add_patch(_patch(ax, begin, end - begin, _STATES[str(states[a])]))
-        if end - begin > 0.06:
-            ax.text((begin + end) / 2, 1.075, str(states[a]), transform=ax.transAxes, fontsize=7, ha="center",
-                    va="center", color="white" if states[a] == "active" else MUTED)  # fmt: skip
-
-
-def _patch(ax: Axes, left: float, wide: float, color: str) -> Rectangle:
-    return Rectangle((left, 1.03), wide, 0.09, transform=ax.transAxes, color=color, clip_on=False, lw=0)
+        ax.axvspan(time_h[a], time_h[b - 1], 1.08, 1.17, color=_STATES[str(states[a])], lw=0, clip_on=False)

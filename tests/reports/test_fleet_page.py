@@ -10,7 +10,7 @@ import pytest
 
 from data.errors import InputError
 from reports.fleet import fleet_page, write_fleet_page
-from reports.layout import Table, Text
+from reports.layout import Items, Table, Text
 from tests.toys.pages import blocks, section, unscripted
 
 HEADS = ("name", "champion", "seen", "expected", "newer", "outside", "sensors", "next", "failure")
@@ -44,9 +44,9 @@ UNKNOWN = row_of(
 
 def test_values_and_reasons() -> None:
     page = fleet_page([DRIFTING, row_of("hmc"), UNKNOWN], [("mill", "z", "error S 6 µm above")], [], NOW)
-    alerts, table = blocks(page, Table)
+    (alerts,), (table,) = blocks(page, Items), blocks(page, Table)
     assert blocks(page, Text)[0].text == "1 alert on 1 of 3 machines."
-    assert [r.cells for r in alerts.rows] == [("mill", "z", "error S 6 µm above")]
+    assert alerts.items == ("mill z: error S 6 µm above",)
     mill, hmc, lathe = (dict(zip(HEADS, r.cells, strict=True)) for r in table.rows)
     assert [r.look for r in table.rows] == ["alert", "ok", "none"]
     assert mill["newer"].alert and mill["newer"].text == "6 µm"
