@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import matplotlib as mpl
@@ -114,12 +113,3 @@ def headed(fig: Figure, title: str, simulated: bool) -> None:
         fig.text(
             1 - 0.05 / wide, y, "SIMULATED", fontsize=7.5, color=ORANGE, fontweight="bold", va="center", ha="right"
         )
-
-
-def legend_row(fig: Figure, entries: Sequence[tuple[str, str, str]], left_in: float, top_in: float) -> None:
-    """Mark, label and colour of each entry in a row that begins `left_in`, `top_in` from the upper left corner."""
-    wide, y, x = fig.get_figwidth(), 1 - top_in / fig.get_figheight(), left_in
-    for mark, label, color in entries:
-        fig.text(x / wide, y, mark, fontsize=9.5, color=color, va="center")
-        fig.text((x + 0.17) / wide, y, label, fontsize=8.5, color=MUTED, va="center")
-        x += 0.36 + 0.072 * len(label)

@@ -6,10 +6,8 @@ without a macro does not appear there: Markdown has no figures.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
 from data.units import in_error_unit
@@ -17,55 +15,6 @@ from reports.viewer import Viewer
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-_MANTISSAS = ((1, 1.5, 2, 3, 4, 5, 6, 8), (1, 2, 3, 5), (1, 2, 5), (1, 3), (1,))  # densest first
-_CLOSEST, _MOST_TICKS = 7.0, 7  # least distance of two ticks, in 0..100
-
-
-@dataclass(frozen=True)
-class Scale:
-    """A logarithmic axis in µm; positions in 0..100."""
-
-    low_um: float
-    high_um: float
-
-    @classmethod
-    def over(cls, values_um: Sequence[float], cap_um: float) -> Scale:
-        """From the least positive value to the greatest, at most `cap_um`."""
-        good = [v for v in values_um if math.isfinite(v) and v > 0] or [1.0]
-        low = min(good)
-        high = max(min(max(good), cap_um) if cap_um > low else max(good), 2 * low)
-        return cls(low / 1.1, high * 1.1)
-
-    def at(self, value_um: float) -> float:
-        """Position of a value, kept inside the axis."""
-        if not value_um > self.low_um:
-            return 0.0
-        share = math.log(value_um / self.low_um) / math.log(self.high_um / self.low_um)
-        return round(100 * min(share, 1.0), 1)
-
-    @property
-    def ticks(self) -> list[tuple[float, str]]:
-        """Round values inside the axis, as many as it holds without crowding, with their positions."""
-        best: list[float] = []
-        for values in (*self._even(), *self._powers()):
-            best = [v for v in values if self.low_um <= v <= self.high_um]
-            at = [self.at(v) for v in best]
-            if 2 <= len(best) <= _MOST_TICKS and all(b - a >= _CLOSEST for a, b in pairwise(at)):
-                break
-        return [(self.at(v), f"{v:.3g}") for v in best or (self.low_um, self.high_um)]
-
-    def _even(self) -> list[list[float]]:
-        """Evenly spaced values, finest first, for an axis too short for powers of ten."""
-        if self.high_um > 3 * self.low_um:
-            return []
-        unit = 10.0 ** math.floor(math.log10(self.high_um - self.low_um))
-        steps = [m * unit for m in (0.1, 0.2, 0.5, 1.0, 2.0)]
-        return [[k * s for k in range(math.ceil(self.low_um / s), math.floor(self.high_um / s) + 1)] for s in steps]
-
-    def _powers(self) -> list[list[float]]:
-        powers = range(math.floor(math.log10(self.low_um)), math.ceil(math.log10(self.high_um)) + 1)
-        return [[m * 10.0**p for p in powers for m in mantissas] for mantissas in _MANTISSAS]
 
 
 @dataclass(frozen=True)
@@ -206,12 +155,11 @@ class Panel:
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph; `strong` stands in bold before it, `link` is (label, anchor) behind it."""
+    """A paragraph; `strong` stands in bold before it."""
 
     text: str
     look: str = ""  # classes of the style sheet: note, soft, caution, lead, law, ...
     strong: str = ""
-    link: tuple[str, str] = ("", "")
 
 
 @dataclass(frozen=True)
@@ -232,22 +180,6 @@ class Pairs:
 
 
 @dataclass(frozen=True)
-class Number:
-    """A large number with what it is."""
-
-    label: str
-    value: str
-    what: str = ""
-
-
-@dataclass(frozen=True)
-class Numbers:
-    """Large numbers in a row."""
-
-    entries: tuple[Number, ...]
-
-
-@dataclass(frozen=True)
 class Heading:
     """A heading inside of a section, with a chip (text, look)."""
 
@@ -259,7 +191,7 @@ class Heading:
 
 @dataclass(frozen=True)
 class Group:
-    """Blocks in a box: pair, narrow, unsealed, changed, claim, or static (for print and without scripts)."""
+    """Blocks in a box: pair, unsealed, changed or claim."""
 
     blocks: tuple[Any, ...]
     look: str
@@ -335,5 +267,5 @@ def _empty(block: Any) -> bool:
     """A panel without plots; a text, a list or a group whose first field, its content, is empty."""
     if isinstance(block, Panel):
         return not block.plots
-    of_content = isinstance(block, Text | Items | Pairs | Numbers | Group)
+    of_content = isinstance(block, Text | Items | Pairs | Group)
     return of_content and not next(iter(vars(block).values()))

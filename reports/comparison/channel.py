@@ -17,7 +17,7 @@ from models.selection.promotion import BASELINES, Choice, lacking, ranked
 from models.selection.result import GridResult, Training
 from reports.comparison.story import Verdict, mark_of, promoted_cell, verdict
 from reports.comparison.tables import MAIN_PROTOCOL, best_per, protocols_of, scored, scores_of
-from reports.labels import NOTHING, cell_label, count, decimals, number, percent, plus_minus
+from reports.labels import NOTHING, cell_label, decimals, number, percent, plus_minus, sentence
 from reports.layout import Cell, Column, Row, Table, Text
 
 _RUNNERS_UP = 2
@@ -51,7 +51,7 @@ class Channel:
         choices = tuple(promoted_cell(t, rule) for t in group)
         expected = outlook(result, choices[0])
         digits = decimals(choices[0].S_std_um, choices[0].n_batches)
-        said = verdict(name, group[0], choices[0])
+        said = verdict(group[0], choices[0])
         runs = _runs(result, *_key(choices[0]), expected.protocol)
         unit = group[0].params.get("unit", "um")
         return cls(name, unit, tuple(group), choices, said, protocol, expected, runs, digits)
@@ -117,26 +117,25 @@ def removed(runs: pd.DataFrame, cost: float = 1.0) -> tuple[float, float]:
     return share, float(np.sqrt((n - 1) / n * np.sum((each - each.mean()) ** 2)))
 
 
-def sentence(c: Channel, rule: PromotionRule) -> tuple[Text, ...]:
+def leads(c: Channel, rule: PromotionRule) -> tuple[Text, ...]:
     """What the channel's model removes of the error of runs that it has not seen, how many runs a champion lacks, and
     what to doubt about it."""
     of = "later runs" if c.expected.protocol == "forward" else "left-out runs"
     S = f"{plus_minus(c.expected.S_um, c.expected.S_std_um, c.digits)} µm"
     none, bound = (f"{number(v, c.digits)} µm" for v in (c.none_um, c.expected.bound_um))
     share = _share(*removed(c.runs, c.cost))
-    text = f"{c.label} removes {share} of the error of {of}, from S {none} to {S}."
+    text = f"{c.label} removes {share} of the error of {of}: S {none} → {S};"
     if c.choice.family == "zero":
-        text = f"nothing is compensated; S of {of} is {S}."
+        text = f"nothing is compensated; S of {of} is {S};"
     elif share == NOTHING:
-        text = f"{c.label} leaves S {S} of {of}."
+        text = f"{c.label} leaves S {S} of {of};"
     below = int((c.runs["S_um"] <= c.expected.bound_um).sum())
-    tested = f"{below} of {count(len(c.runs), 'left-out run')} stay below the 90 % bound of {bound}."
-    if c.expected.kept:
-        tested += f" {c.expected.kept[:1].upper()}{c.expected.kept[1:]}."
-    doubts = [c.verdict.caution, *(f"{t[:1].upper()}{t[1:]}." for t in (c.expected.warning, c.expected.note) if t)]
-    if c.verdict.outcome != "champion" and (few := lacking(c.result, rule, c.choice)):
-        text += f" {few[:1].upper()}{few[1:]}."
-    lead = Text(f"{text} {tested}" if len(c.runs) else text, "lead", f"{c.name}:")
+    tested = f"{below} of {len(c.runs)} stay below the 90 % bound of {bound}."
+    doubts = [c.verdict.caution, sentence(c.expected.warning), sentence(c.expected.note)]
+    text = f"{text} {tested}" if len(c.runs) else f"{text[:-1]}."
+    if c.verdict.outcome != "champion":
+        text += f" {sentence(lacking(c.result, rule, c.choice))}".rstrip()
+    lead = Text(text, "lead", f"{c.name}:")
     return (lead, *(Text(t, "caution") for t in doubts if t))
 
 

@@ -11,7 +11,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator
 from numpy.typing import NDArray
 
 from data.arrays import Array
@@ -19,7 +19,6 @@ from data.sweeps import sweep_numbers
 from reports.comparison.tables import LeftOut
 from reports.drawing import GREY, MUTED, THIRD_IN, headed, panel
 from reports.labels import BLUE, INK, ORANGE, family_label, number, selector_label, tex_escaped
-from reports.layout import Scale
 
 _LEFT_IN, _RIGHT_IN = 0.42, 0.08  # room for tick labels
 
@@ -38,14 +37,13 @@ def say_simulated(ax: Axes, simulated: bool) -> None:
         ax.set_title("SIMULATED", loc="right", fontsize=7.5, color=ORANGE, fontweight="bold", pad=3)
 
 
-def logarithmic(ax: Axes, scale: Scale, axis: str = "y", apart: float = 0.0) -> None:
-    """A logarithmic axis with round ticks, at least `apart` percent of its length from each other."""
-    ticks: list[float] = []
-    for at, label in scale.ticks:
-        if not ticks or at - scale.at(ticks[-1]) >= apart:
-            ticks.append(float(label))
-    ax.set(**{f"{axis}scale": "log", f"{axis}lim": (scale.low_um, scale.high_um)})
-    ax.set(**{f"{axis}ticks": ticks, f"{axis}ticklabels": [f"{v:g}" for v in ticks]})
+def logarithmic(ax: Axes, values_um: Sequence[float], axis: str = "y") -> None:
+    """A logarithmic axis over the finite values above zero, with a few round ticks."""
+    good = [v for v in values_um if math.isfinite(v) and v > 0] or [1.0]
+    own = ax.yaxis if axis == "y" else ax.xaxis
+    ax.set(**{f"{axis}scale": "log", f"{axis}lim": (min(good) / 1.1, 1.1 * max(*good, 2 * min(good)))})
+    own.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=6))
+    own.set_major_formatter("{x:g}")
     ax.minorticks_off()
 
 
@@ -79,7 +77,7 @@ def tried(cells: pd.DataFrame, chosen: str, title: str, levels_um: Mapping[str, 
     for name, level in levels_um.items():
         ax.axvline(level, color=MUTED, lw=1.0, ls=LEVELS[name])
     values = [*cells["S_mean_um"], *levels_um.values()]
-    logarithmic(ax, Scale.over(values, math.inf), "x", apart=18)
+    logarithmic(ax, values, "x")
     ax.set_yticks(range(len(least)), [family_label(f) for f in least["family"]], fontsize=7.5)
     ax.set_ylim(len(least) - 0.4, -0.6)
     ax.set_xlabel("S_mean, µm", fontsize=8, color=MUTED, labelpad=2)
@@ -103,7 +101,7 @@ def in_order(runs: pd.DataFrame, bound_um: float, title: str, simulated: bool) -
     ax.plot(at, runs["S_um"], "o", color=BLUE, ms=4.5)
     if math.isfinite(bound_um):
         ax.axhline(bound_um, color=INK, lw=1.0, ls="--")
-    logarithmic(ax, Scale.over([*runs["none_um"], *(0.85 * runs["S_um"]), 1.1 * bound_um], math.inf))
+    logarithmic(ax, [*runs["none_um"], *(0.85 * runs["S_um"]), 1.1 * bound_um])
     ends = sorted({0, len(runs) - 1})
     ticks = ax.set_xticks(ends, [str(runs["start"].iloc[k])[:10] for k in ends], fontsize=7, ha="left")
     if len(ticks) > 1:

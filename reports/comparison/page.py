@@ -17,7 +17,7 @@ from models.families import FAMILIES
 from models.protocols import PromotionRule
 from models.selection.result import GridResult, Training
 from reports.comparison import pictures, story, tables
-from reports.comparison.channel import Channel, leaders, sentence
+from reports.comparison.channel import Channel, leaders, leads
 from reports.labels import count, family_label, listed, number, selector_label
 from reports.layout import Details, Group, Heading, Items, Page, Pairs, Section, Text, given, with_unit
 from reports.rendering import FORMATS, write_page
@@ -38,7 +38,7 @@ def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
     channels.sort(key=lambda c: -np.nan_to_num(c.none_um))
     units = {c.unit for c in channels}
     unit = unit_label(units.pop()) if len(units) == 1 else "own unit"
-    said = [with_unit(text, c.unit) for c in channels for text in sentence(c, rule)]
+    said = [with_unit(text, c.unit) for c in channels for text in leads(c, rule)]
     left_out = pictures.left_out_panels(channels)
     models = given(pictures.tried_panel(channels), pictures.time_panel(channels))
     blocks = given(
@@ -87,6 +87,7 @@ def _channel(c: Channel, rule: PromotionRule) -> tuple[Any, ...]:
     result, choice, digits = c.result, c.choice, c.digits
     inside = story.certainty(result, choice)
     facts = [("points", ", ".join(choice.inputs)), ("inside the stated 90 % interval", inside)]
+    facts.append(("later runs against the promise", c.expected.kept))
     facts += [("weakness of the selector", text) for text in story.weaknesses(result, choice)]
     facts += story.comparison_rows(c.trainings[0].promotion)
     return given(
@@ -193,9 +194,6 @@ GLOSSARY = (
     ("max |e|", "Largest |recorded − predicted| of any sample of any such batch."),
     ("fitted S", "Mean S on the batches of the fit. Far below S_mean means that the model has learned its batches by "
      "heart."),
-    ("nested", "S_mean ± S_std when every batch is predicted by the cell that the other batches chose. The best of "
-     "many cells looks better than it is; this number does not."),
-    ("of no model", "S_mean as a share of what is left when nothing is compensated."),
     ("points", "Temperature-sensitive points (TSP): the sensors that a model takes as inputs."),
     ("stability of points", "Mean Jaccard similarity |A∩B| / |A∪B| of the sets chosen in different folds. 1: always "
      "the same points."),

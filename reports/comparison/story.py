@@ -28,6 +28,7 @@ def findings_of(results: Sequence[GridResult]) -> pd.DataFrame:
     if not parts:
         return pd.DataFrame(columns=[*_FINDING_KEYS, "machine"])
     every = pd.concat(parts, ignore_index=True).drop_duplicates()
+    every = every.assign(masks=every["masks"].ne(False)).fillna({"channel": "", "words": "", "overruled": ""})
     return every.sort_values(["machine", "batch_id", "channel", "start_s"], kind="stable").reset_index(drop=True)
 
 
@@ -35,8 +36,8 @@ def findings_summary(found: pd.DataFrame, n_batches: int) -> str:
     """One sentence about all findings."""
     if found.empty:
         return f"The checks raised no finding in {count(n_batches, 'batch')} and masked no sample."
-    overruled = found["overruled"].map(_text).astype(bool)
-    masked = int((found["masks"].map(_yes) & ~overruled).sum())
+    overruled = found["overruled"].astype(bool)
+    masked = int((found["masks"] & ~overruled).sum())
     with_any = found[["machine", "batch_id"]].drop_duplicates()
     where = f"{count(len(found), 'finding')} in {len(with_any)} of {count(n_batches, 'batch')}"
     summary = f"{where}: {masked} masked for training"
@@ -50,10 +51,10 @@ def findings(found: pd.DataFrame) -> Table:
     rows = [
         Row.of(
             str(f["batch_id"]),
-            _text(f["channel"]) or "all channels",
+            str(f["channel"]) or "all channels",
             str(f["check"]).replace("_", " "),
-            between(_time(f["start_s"]), _time(f["end_s"])),
-            _text(f["words"]),
+            between(float(f["start_s"]), float(f["end_s"])),
+            str(f["words"]),
             _effect(f),
         )
         for f in found.to_dict("records")
@@ -147,22 +148,9 @@ def changed_batches(now: pd.DataFrame, earlier: pd.DataFrame) -> tuple[list[str]
 
 
 def _effect(finding: dict[Any, Any]) -> str:
-    reason = _text(finding["overruled"])
-    if reason:
-        return f"used; overruled: {reason}"
-    return "masked" if _yes(finding["masks"]) else "used; noted only"
-
-
-def _time(value: object) -> float:
-    return float(value) if isinstance(value, int | float | np.floating) else math.nan
-
-
-def _text(value: object) -> str:
-    return "" if value is None or (isinstance(value, float) and math.isnan(value)) or value is pd.NA else str(value)
-
-
-def _yes(value: object) -> bool:
-    return bool(value) if isinstance(value, bool | np.bool_) else True
+    if finding["overruled"]:
+        return f"used; overruled: {finding['overruled']}"
+    return "masked" if finding["masks"] else "used; noted only"
 
 
 def interval_label(comparison: dict[str, float], digits: int = 2) -> str:
@@ -188,7 +176,6 @@ _CHIPS = {
 class Verdict:
     """One channel's outcome: a chip, what was promoted and why, a caution (empty where there is none)."""
 
-    channel: str
     outcome: str
     chip: str
     summary: str
@@ -218,33 +205,15 @@ def promoted_cell(training: Training, rule: PromotionRule) -> Choice:
     return own
 
 
-def verdict(channel: str, training: Training, choice: Choice) -> Verdict:
-    """Who is champion and why."""
+def verdict(training: Training, choice: Choice) -> Verdict:
+    """Who is champion and why, as the promotion recorded it."""
     p = training.promotion
-    outcome = str(p.get("outcome", ""))
-    digits = decimals(choice.S_std_um, choice.n_batches)
-    score = _score(choice, digits)
+    outcome, now = str(p.get("outcome", "")), p.get("champion_version")
     model = cell_label(choice.selector, choice.family, choice.n_tsp)
-    if outcome == "champion" and p["version"] == p.get("champion_version"):
-        summary = f"Version {p['version']}, {model}, is champion: {score}; {_why_champion(p)}."
-    elif outcome == "champion":  # replaced or rolled back since
-        outcome = "former"
-        why = _why_champion(p).replace("it is", "it was", 1).replace("replaces", "it replaced", 1)
-        summary = f"Version {p['version']}, {model}, was champion: {score}; {why}. {_champion_now(p)} now."
-    elif outcome == "provisional":
-        summary = (
-            f"Version {p['version']}, {model}, is provisional: {score}; {float(p.get('authority', 0.0)):g} of its "
-            "correction is supported, and `compensate` runs it with the switch `--provisional`."
-        )
-    elif outcome == "challenger":
-        summary = f"{_champion_now(p)}; version {p['version']}, {model}, is challenger: {score}; {_why_challenger(p)}."
-    elif outcome == "unchanged":
-        summary = (
-            f"Nothing new: batches, cell and machine file are those of version {p['version']}, {model}: {score}. "
-            f"{_champion_now(p)}."
-        )
-    else:
-        summary = f"Nothing was promoted. The rule would take {model}: {score}."
+    summary = f"{p['words']}." if p else f"Nothing was promoted. The rule would take {model}: {choice.summary}."
+    if p and p["version"] != now:
+        outcome = "former" if outcome == "champion" else outcome  # replaced or rolled back since
+        summary += f" Version {now} is champion now." if now else " There is no champion."
     if p.get("faults"):
         summary += f" At the machine {p['faults']}."
     why = str(p.get("caution", "")) if p else choice.caution
@@ -255,12 +224,7 @@ def verdict(channel: str, training: Training, choice: Choice) -> Verdict:
     caution = f"{lacking}: {short}." if why else ""
     summary += f" {doubt}: {why}." if why != short else ""
     chip = lacking.lower() if (why or provisional) and not p.get("champion_version") else _CHIPS.get(outcome, outcome)
-    return Verdict(channel, "untrusted" if why else outcome, chip, summary, caution)
-
-
-def _champion_now(p: dict[str, Any]) -> str:
-    now = p.get("champion_version")
-    return f"Version {now} is champion" if now else "There is no champion"
+    return Verdict("untrusted" if why else outcome, chip, summary, caution)
 
 
 def mark_of(training: Training) -> str:
@@ -288,45 +252,6 @@ def comparison_rows(promotion: dict[str, Any]) -> list[tuple[str, str]]:
         ("one-sided paired sign-flip test", p_label(c["p_value"]) if math.isfinite(c["p_value"]) else "–"),
         ("decision", "replaces the champion" if promotion["outcome"] == "champion" else "the champion stays"),
     ]
-
-
-def _why_champion(p: dict[str, Any]) -> str:
-    c = p.get("comparison")
-    forced = p.get("forced", False)
-    if not c:
-        return "put in place by force" if forced else "it is the first model of this machine and channel"
-    old = p.get("against")
-    reason = f"replaces version {old}" if old else "replaces the former champion"
-    reason += " by force" if forced and not c["better"] else ""
-    if not math.isfinite(c["difference_um"]):
-        return reason
-    return f"{reason}, {interval_label(c)} on {count(c['n_batches'], 'batch')}"
-
-
-def _why_challenger(p: dict[str, Any]) -> str:
-    c = p.get("comparison")
-    if p.get("caution"):
-        return "it is not trustworthy"
-    if not c:
-        return "it could not be compared with the champion" + (f" ({p['obstacle']})" if p.get("obstacle") else "")
-    if "need at least" in str(c.get("words", "")):
-        return str(c["words"]).replace(": the champion stays", "")
-    return (
-        f"on {count(c['n_batches'], 'batch')} it is {interval_label(c)}, {p_label(c['p_value'])}: "
-        "not shown to be better"
-    )
-
-
-def _score(choice: Choice, digits: int) -> str:
-    """S on left-out batches; where choosing among the cells costs, first the score that the choice does not flatter."""
-    own, under = (
-        plus_minus(choice.S_mean_um, choice.S_std_um, digits),
-        f"{choice.protocol}, {count(choice.n_batches, 'batch')}",
-    )
-    if not choice.nested_S_mean_um > choice.S_mean_um:
-        return f"{own} µm on left-out batches ({under})"
-    nested = plus_minus(choice.nested_S_mean_um, choice.nested_S_std_um, digits)
-    return f"{nested} µm where the other batches choose the model of each ({under}); {own} µm for the model itself"
 
 
 _MEANT, _TOLERATED = 0.90, 0.05

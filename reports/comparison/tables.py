@@ -12,7 +12,7 @@ import pandas as pd
 from data.arrays import Array
 from models.protocols import PROTOCOLS
 from models.selection.conformal import RunBound
-from models.selection.promotion import BASELINES, KEYS, Choice
+from models.selection.promotion import KEYS, Choice
 from models.selection.result import GridResult
 from models.selection.trust import SLACK
 from models.selection.updating import COUNTS
@@ -57,11 +57,6 @@ def scored(result: GridResult, protocol: str) -> pd.DataFrame:
 def best_per(cells: pd.DataFrame, *keys: str) -> pd.DataFrame:
     """First, so least, row of every combination of keys of a table from `scored`."""
     return cells.drop_duplicates(list(keys)).reset_index(drop=True)
-
-
-def is_baseline(cells: pd.DataFrame) -> pd.Series:
-    """Rows of the families that every table must hold."""
-    return cells["family"].isin(BASELINES)
 
 
 def left_out_batches(result: GridResult, choice: Choice) -> list[LeftOut]:

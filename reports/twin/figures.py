@@ -7,66 +7,16 @@ import textwrap
 from collections.abc import Sequence
 
 import numpy as np
-import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from data.arrays import Array
 from data.batch import Batch
 from data.units import unit_label
-from reports.drawing import LINES, MUTED, SIGNED, SIZE, WIDTH_IN, calm, head, legend_row, picture_bytes
-from reports.labels import BLUE, INK, ORANGE, count, number, tex_escaped
+from reports.drawing import LINES, MUTED, SIGNED, WIDTH_IN, calm, head, picture_bytes
+from reports.labels import BLUE, INK, ORANGE, count, tex_escaped
 from reports.twin.iso230_3 import side_legend, stacked
 from twin.views.compared import Compared
 from twin.views.overview import ModeView, time_words
-
-_COLUMNS = 4
-
-
-def fit_figure(shown: Compared) -> Figure:
-    """Small multiples: recorded and simulated above, their difference below, a column per channel."""
-    n = len(shown.channels)
-    columns = min(_COLUMNS, max(n, 1))
-    rows = max(math.ceil(n / columns), 1)
-    fig = Figure(figsize=(WIDTH_IN, 2.35 * rows + 0.75))
-    top, low, wide = 1 - 0.62 / fig.get_figheight(), 0.5 / fig.get_figheight(), 1.0
-    hours = shown.time_s / 3600
-    for k in range(n):
-        r, c = divmod(k, columns)
-        left = 0.055 + c * (0.945 / columns)
-        width = wide * 0.945 / columns - 0.045
-        cell = (top - low) / rows
-        bottom = top - (r + 1) * cell
-        upper = fig.add_axes((left, bottom + 0.40 * cell, width, 0.43 * cell))
-        lower = fig.add_axes((left, bottom + 0.14 * cell, width, 0.22 * cell), sharex=upper)
-        _pair(upper, lower, hours, shown, k, bottom_row=k + columns >= n)
-    head(fig, f"{shown.batch_id}: recorded and simulated", shown.simulated)
-    legend_row(
-        fig, [("—", "recorded", INK), ("—", "simulated", BLUE), ("—", "recorded − simulated", ORANGE)], 0.58, 0.52
-    )
-    return fig
-
-
-def _pair(upper: Axes, lower: Axes, hours: Array, shown: Compared, k: int, bottom_row: bool) -> None:
-    for ax in (upper, lower):
-        calm(ax)
-    upper.plot(hours, shown.recorded[k], color=INK, lw=1.0, label="recorded")
-    upper.plot(hours, shown.computed[k], color=BLUE, lw=1.8, alpha=0.9, label="simulated")
-    lower.plot(hours, shown.residual[k], color=ORANGE, lw=1.0, label="residual")
-    lower.axhline(0, color=MUTED, lw=0.6)
-    unit = unit_label(shown.units[k])
-    level = "°C" if unit == "K" else unit
-    title = f"{shown.channels[k]}, {level}"
-    upper.set_title(tex_escaped(title), fontsize=9, loc="left", color=INK, pad=3)
-    upper.set_title(f"rms {number(float(shown.rms[k]), 2)} {unit}", fontsize=8, loc="right", color=ORANGE, pad=3)
-    upper.tick_params(labelbottom=False)
-    lower.set_xlim(hours[0], hours[-1] if hours[-1] > hours[0] else hours[0] + 1)
-    lower.locator_params(axis="y", nbins=3)
-    upper.locator_params(axis="y", nbins=4)
-    if bottom_row:
-        lower.set_xlabel("time, h", fontsize=8, labelpad=1)
-    else:
-        lower.tick_params(labelbottom=False)
 
 
 def residual_map(shown: Compared) -> Figure:
@@ -97,43 +47,6 @@ def residual_map(shown: Compared) -> Figure:
         y -= h + 0.62
         ax.set_xlabel("time, h", fontsize=8, labelpad=1)
     head(fig, f"{shown.batch_id}: residual, recorded − simulated", shown.simulated)
-    return fig
-
-
-def rms_map(rms: pd.DataFrame, simulated: bool, title: str = "Residual rms of every batch and channel") -> Figure:
-    """Batch × channel with its numbers; the colour counts within the channels of one unit.
-
-    Args:
-        rms: batch, channel, unit, rms, as `twin.views.compared.rms_table` gives it.
-    """
-    batches, channels = list(dict.fromkeys(rms["batch"])), list(dict.fromkeys(rms["channel"]))
-    unit = rms.drop_duplicates("channel").set_index("channel")["unit"]
-    wide = rms.pivot(index="batch", columns="channel", values="rms").reindex(index=batches, columns=channels)
-    values = wide.to_numpy(float)
-    high = 0.27 * len(batches) + 1.2
-    fig = Figure(figsize=(WIDTH_IN, high))
-    ax = fig.add_axes((0.16, 0.08 / high, 0.83, 0.27 * len(batches) / high))
-    shade = np.zeros_like(values)
-    for u in dict.fromkeys(unit):
-        at = [i for i, c in enumerate(channels) if unit[c] == u]
-        shade[:, at] = values[:, at] / max(float(np.nanmax(values[:, at], initial=0.0)), 1e-12)
-    ax.imshow(shade, aspect="auto", cmap=SIZE, vmin=0, vmax=1, interpolation="nearest")
-    for i in range(len(batches)):
-        for j in range(len(channels)):
-            if np.isfinite(values[i, j]):
-                text = number(values[i, j], 2 if values[i, j] < 9.95 else 1)
-                ax.text(j, i, text, ha="center", va="center", fontsize=8, color="white" if shade[i, j] > 0.6 else INK)
-    ax.set_yticks(range(len(batches)), [tex_escaped(b) for b in batches], fontsize=8)
-    names = [tex_escaped(f"{c.replace('_', chr(10)) if len(c) > 9 else c}\n{unit_label(unit[c])}") for c in channels]
-    ax.set_xticks(range(len(channels)), names, fontsize=8)
-    ax.xaxis.tick_top()
-    ax.tick_params(length=0)
-    ax.spines[:].set_visible(False)
-    ax.set_xticks(np.arange(len(channels) + 1) - 0.5, minor=True)
-    ax.set_yticks(np.arange(len(batches) + 1) - 0.5, minor=True)
-    ax.grid(which="minor", color="white", lw=1.5)
-    ax.tick_params(which="minor", length=0)
-    head(fig, title, simulated)
     return fig
 
 

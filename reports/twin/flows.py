@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, to_hex
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch
+from matplotlib.patches import FancyArrowPatch, Patch
 
 from data.arrays import Array
-from reports.drawing import MUTED, WIDTH_IN, calm, head
+from reports.drawing import WIDTH_IN, calm, head
 from reports.labels import INK, number, tex_escaped
 from reports.twin.network_picture import (
     LINK,
@@ -41,26 +40,28 @@ def heat_stack(flows: HeatFlows) -> Figure:
     fig = Figure(figsize=(WIDTH_IN, 5.4))
     ax = fig.add_axes((0.07, 0.10, 0.66, 0.80))
     calm(ax)
-    hours = np.repeat(flows.time_s / 3600, 2)[1:-1]
-    groups: list[tuple[str, Mapping[str, Array], LinearSegmentedColormap, float]] = [
-        ("heat", flows.heat_W, _HEATS, 1.0),
-        ("taken by", flows.loss_W, _LOSSES, -1.0),
+    groups = (
+        ("heat", flows.heat_W, _HEATS, 1.0), ("taken by", flows.loss_W, _LOSSES, -1.0),
         ("stored in", _greatest(flows.storage_W, flows.dt_s, _MOST_STORES), _STORES, -1.0),
-    ]
-    up, down = np.zeros(len(flows.dt_s)), np.zeros(len(flows.dt_s))
-    entries: list[tuple[str, str, float]] = []
-    duration_s = float(flows.dt_s.sum())
+    )  # fmt: skip
+    parts: list[tuple[Array, str]] = []
+    keys = []
     for group, series, colors, sign in groups:
-        entries.append((group, "", float("nan")))
+        keys.append(Patch(alpha=0.0, label=f"{group}, mean"))
         for k, (name, watts) in enumerate(series.items()):
-            color = to_hex(colors(k / max(len(series) - 1, 1)))
-            up, down = _area(ax, hours, sign * watts, up, down, color, f"{group} {name}")
-            entries.append((name, color, float(watts @ flows.dt_s) / duration_s))
+            parts.append((sign * np.append(watts, watts[-1]), to_hex(colors(k / max(len(series) - 1, 1)))))
+            mean_W = float(watts @ flows.dt_s / flows.dt_s.sum())
+            keys.append(Patch(color=parts[-1][1], label=f"{tex_escaped(name)}, {watts_label(mean_W)}"))
+    hours = flows.time_s / 3600
+    for side in (np.maximum, np.minimum):
+        shown = [(side(watts, 0.0), color) for watts, color in parts if np.any(side(watts, 0.0))]
+        areas, colors_of = zip(*shown, strict=True) if shown else ((), ())
+        ax.stackplot(hours, *areas, colors=colors_of, step="post", lw=0.3, ec="white")
     ax.axhline(0, color=INK, lw=0.9)
     ax.set_xlim(hours[0], hours[-1])
     ax.set_xlabel("time, h", fontsize=9)
     ax.set_ylabel("W, put in above, stored and given off below", fontsize=9)
-    _entries(fig, entries)
+    ax.legend(handles=keys, loc="upper left", bbox_to_anchor=(1.01, 1.02), frameon=False, fontsize=8.5)
     head(fig, f"{flows.batch_id}: where the watts go", flows.simulated)
     return fig
 
@@ -75,32 +76,6 @@ def _greatest(series: Mapping[str, Array], dt_s: Array, most: int) -> dict[str, 
     elif rest:
         out[f"{len(rest)} others"] = np.sum([series[n] for n in rest], axis=0)
     return out
-
-
-def _area(ax: Axes, hours: Array, watts: Array, up: Array, down: Array, color: str, label: str) -> tuple[Array, Array]:
-    """Stack a series: its positive part on what is above, its negative part below; steps, as means of intervals are."""
-    for part, base in ((np.maximum(watts, 0.0), up), (np.minimum(watts, 0.0), down)):
-        if np.any(part):
-            ax.fill_between(
-                hours, np.repeat(base, 2), np.repeat(base + part, 2), color=color, lw=0.3, ec="white", label=label
-            )
-    return up + np.maximum(watts, 0.0), down + np.minimum(watts, 0.0)
-
-
-def _entries(fig: Figure, entries: Sequence[tuple[str, str, float]]) -> None:
-    y = 0.89
-    fig.text(0.985, y + 0.005, "mean W", fontsize=8, color=MUTED, ha="right", va="center")
-    for name, color, mean in entries:
-        if not color:
-            y -= 0.012
-            fig.text(0.75, y, name, fontsize=8.5, color=INK, va="center", fontweight="bold")
-        else:
-            fig.text(0.755, y, "■", fontsize=10, color=color, va="center")
-            fig.text(0.777, y, tex_escaped(name), fontsize=8.5, color=INK, va="center")
-            fig.text(
-                0.985, y, number(mean, 0 if abs(mean) >= 9.95 else 1), fontsize=8.5, color=INK, ha="right", va="center"
-            )
-        y -= 0.036
 
 
 WARMTH = LinearSegmentedColormap.from_list("warmth", ["#8ec3e6", "#f4f7fa", "#fbd9bd", "#f0a266", "#e27a35"])

@@ -14,10 +14,10 @@ from data.batch import Batch
 from data.errors import InputError, check_suffix
 from data.machine import LEAD_ROWS, Machine
 from reports.drawing import picture, picture_bytes
-from reports.layout import Group, Heading, Items, Page, Pairs, Section, Text, given
+from reports.layout import Heading, Items, Page, Pairs, Section, Text, given
 from reports.rendering import write_page
 from reports.twin import tables
-from reports.twin.figures import fit_figure, mode_shapes, residual_map, rms_map
+from reports.twin.figures import mode_shapes, residual_map
 from reports.twin.flows import flow_picture, heat_stack
 from reports.twin.network_picture import network_picture
 from reports.viewer import Pane, Trace, viewer
@@ -136,14 +136,12 @@ def _fit(data: TwinData, most: int, pictures: bool) -> Section:
     blocks.append(tables.left_out(data.left_out, data.view.simulated) if data.left_out is not None else None)
     if pictures and data.compared:
         blocks.append(viewer("Recorded and simulated", _panes(data.compared), simulated))
-        label = "Residual rms of every batch and channel"
-        blocks.append(picture(rms_map(rms_table(data.compared), simulated), label, simulated, look="full"))
+    if data.compared:
+        blocks.append(tables.rms(rms_table(data.compared), simulated))
     if len(chosen) < len(data.compared):
         said = f"Drawn: the {len(chosen)} of {len(data.compared)} batches with the greatest residual."
         blocks.append(Text(said, "note"))
     for c in chosen if pictures else ():
-        fit = picture(fit_figure(c), f"{c.batch_id}: recorded and simulated", c.simulated, look="full")
-        blocks.append(Group((fit,), "static"))
         blocks.append(picture(residual_map(c), f"{c.batch_id}: residual map", c.simulated, look="full"))
     return Section("fit", "Simulated against recorded", given(*blocks))
 

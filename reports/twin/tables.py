@@ -168,3 +168,20 @@ def left_out(table: pd.DataFrame, simulated: bool) -> Table:
         Column("if nothing moved", "rms", "number"),
     )  # fmt: skip
     return Table("Batches left out of the calibration, predicted", columns, tuple(rows), simulated)
+
+
+def rms(table: pd.DataFrame, simulated: bool) -> Table:
+    """The rms of the residual of every batch and channel.
+
+    Args:
+        table: batch, channel, unit, rms, as `twin.views.compared.rms_table` gives it.
+    """
+    units = table.drop_duplicates("channel").set_index("channel")["unit"]
+    wide = table.pivot(index="batch", columns="channel", values="rms")[list(units.index)]
+    wide = wide.loc[list(dict.fromkeys(table["batch"]))]
+    rows = tuple(
+        Row.of(str(batch), *(number(v, 2 if v < 9.95 else 1) for v in values))
+        for batch, values in zip(wide.index, wide.to_numpy(float), strict=True)
+    )
+    columns = (Column("batch"), *(Column(str(c), unit_label(str(u)), "number") for c, u in units.items()))
+    return Table("Residual rms of every batch and channel", columns, rows, simulated)

@@ -15,12 +15,12 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
 from data.errors import InputError
 from reports.drawing import picture_bytes
-from reports.twin.figures import fit_figure, mode_shapes, residual_map, rms_map
+from reports.twin.figures import mode_shapes, residual_map
 from reports.twin.flows import flow_picture, heat_stack
 from reports.twin.network_picture import chain_label, heat_lines, network_picture, sensor_lines
 from reports.twin.page import write_picture
+from reports.twin.tables import rms
 from tests.reports.toy_twin import batch, flows
-from twin.views.compared import rms_table
 from twin.views.overview import ModeView, Overview
 
 SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
@@ -127,10 +127,11 @@ def test_many_laws_and_sensors_in_one_body_are_counted(view: Overview) -> None:
 def test_the_stack_names_what_it_shows_and_both_sides_are_equal(view: Overview) -> None:
     f = flows(view)
     fig = heat_stack(f)
-    said = texts(fig)
-    assert {"heat", "taken by", "stored in", "front_bearings", "room", "floor", "bed", "8 others", "SIMULATED"} <= set(
-        said
-    )
+    legend = fig.axes[0].get_legend()
+    assert legend is not None and "SIMULATED" in texts(fig)
+    said = [t.get_text() for t in legend.get_texts()]
+    names = {"heat", "taken by", "stored in", "front_bearings", "room", "floor", "bed", "8 others"}
+    assert names <= {text.partition(",")[0] for text in said} and all(t.endswith((" W", ", mean")) for t in said)
     heights = [path.get_paths()[0].get_extents() for path in fig.axes[0].collections]
     assert max(h.y1 for h in heights) == pytest.approx(70 + 5)
     assert min(h.y0 for h in heights) == pytest.approx(-(70 - 3.2 + 3 + 13 * 0.4))
@@ -152,18 +153,6 @@ def test_flows_have_direction_watts_and_rises(view: Overview) -> None:
 # fit
 
 
-def test_a_fit_shows_both_lines_the_residual_and_its_rms() -> None:
-    fig = fit_figure(batch())
-    assert len(fig.axes) == 6
-    said = texts(fig)
-    assert {"front, °C", "room<1>, °C", "z, µm", "rms 0.50 K", "rms 2.00 µm", "recorded − simulated"[:8]} & set(said)
-    assert "rms 2.00 µm" in said and "rms 0.50 K" in said and "SIMULATED" not in said
-    upper, lower = fig.axes[0], fig.axes[1]
-    assert [line.get_label() for line in upper.lines] == ["recorded", "simulated"]
-    np.testing.assert_allclose(np.asarray(lower.lines[0].get_ydata()), 0.5)
-    assert "SIMULATED" in texts(fit_figure(batch(simulated=True)))
-
-
 def test_a_residual_map_has_a_row_per_channel_and_colours_about_zero() -> None:
     fig = residual_map(batch())
     images = [ax.images[0] for ax in fig.axes if ax.images and len(ax.get_yticklabels()) and ax.get_xlabel()]
@@ -174,14 +163,14 @@ def test_a_residual_map_has_a_row_per_channel_and_colours_about_zero() -> None:
     assert np.ma.masked_invalid(images[0].get_array()).mask.sum() == 3  # type: ignore[arg-type]
 
 
-def test_the_rms_map_prints_its_numbers_and_leaves_what_is_missing_empty() -> None:
-    table = pd.DataFrame(
+def test_the_table_of_rms_leaves_what_is_missing_empty() -> None:
+    given = pd.DataFrame(
         [("b1", "front", "K", 9, 0.123), ("b1", "z", "um", 9, 12.3), ("b2", "front", "K", 9, 0.5)],
         columns=["batch", "channel", "unit", "rows", "rms"],
     )
-    said = texts(rms_map(table, True))
-    assert {"0.12", "12.3", "0.50", "front\nK", "z\nµm", "b1", "b2", "SIMULATED"} <= set(said)
-    assert sum(bool(re.fullmatch(r"[\d.]+", t)) for t in said) == 3
+    table = rms(given, True)
+    assert [(c.title, c.unit) for c in table.columns] == [("batch", ""), ("front", "K"), ("z", "µm")]
+    assert [r.cells for r in table.rows] == [("b1", "0.12", "12.3"), ("b2", "0.50", "–")] and table.simulated
 
 
 def test_mode_shapes_have_a_bar_per_body() -> None:
@@ -198,4 +187,4 @@ def test_mode_shapes_have_a_bar_per_body() -> None:
 
 def test_figures_become_png_and_svg() -> None:
     for kind, head in (("png", b"\x89PNG"), ("svg", b"<?xml")):
-        assert picture_bytes(rms_map(rms_table([batch()]), False), kind).startswith(head)
+        assert picture_bytes(residual_map(batch()), kind).startswith(head)

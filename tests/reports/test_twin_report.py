@@ -79,7 +79,7 @@ def written(view: Overview, network: Network, tmp_path_factory: pytest.TempPathF
 def test_the_page_holds_everything_it_needs(written: Path) -> None:
     text = unscripted(written.read_text(encoding="utf-8"))
     assert not re.findall(r'(?:src|href)="(?!data:|#)', text) and "default-src 'none'" in text
-    assert text.count("data:image/") == 7  # network, map, fit, residuals, stack, flows, modes
+    assert text.count("data:image/") == 5  # network, residuals, stack, flows, modes
     for part in (
         "Network",
         "Parameters",
@@ -96,7 +96,7 @@ def test_simulated_is_said_on_the_page_and_in_the_pictures(written: Path) -> Non
     text = written.read_text(encoding="utf-8")
     assert "Twin of sample_vmc (SIMULATED)</title>" in text and '<span class="badge">SIMULATED</span></h1>' in text
     assert 'alt="b1: where the watts go (SIMULATED)"' in text
-    assert 'alt="b1: recorded and simulated"' in text  # this recording is real
+    assert 'alt="b1: residual map"' in text  # this recording is real
 
 
 def test_the_markdown_has_the_tables_and_no_picture(written: Path) -> None:
