@@ -194,14 +194,15 @@ def _page(experiment: str, machine: str, target: str) -> dict[str, str]:
             "attributes.`Run Name`": 330, "metrics.`expected_S_um`": 125, "metrics.`expected_S_bound90_um`": 180,
         },
     }  # fmt: skip
-    note = _note(experiment, machine, target)
+    note = _note(experiment, f"Thermal error {target} of {machine}")
     tags = {"mlflow.experimentKind": "custom_model_development", _NOTE: note, _SHARED + _VIEW: json.dumps(view)}
     return tags if target != DIAGNOSIS else {**tags, _NOTE: f"Diagnoses of {machine}", _SHARED + _VIEW: "{}"}
 
 
-def _note(experiment: str, machine: str, target: str, champion: str = "") -> str:
+def _note(experiment: str, about: str) -> str:
+    """MLflow shows its first line, of some 80 characters."""
     link = f"#/experiments/{experiment}/runs?viewStateShareKey={_VIEW}&workflowType=machine_learning"
-    return f"Thermal error {target} of {machine}. {champion}[Compare trainings]({link})"
+    return f"{about}. [Compare trainings]({link})"
 
 
 def mark_champion(client: MlflowClient, training_id: str, version: str) -> None:
@@ -221,8 +222,7 @@ def mark_champion(client: MlflowClient, training_id: str, version: str) -> None:
     name = str(run.info.run_name).removeprefix(_STAR)
     client.set_tag(training_id, _NAME, _STAR + name)
     if f"viewStateShareKey={_VIEW}" in experiment.tags.get(_NOTE, ""):
-        machine, target = (experiment.tags[k] for k in ("machine", "target"))
-        note = _note(run.info.experiment_id, machine, target, f"{_STAR}Champion: version {version}, {name}. ")
+        note = _note(run.info.experiment_id, f"{_STAR}Champion: version {version}, {name}")
         client.set_experiment_tag(run.info.experiment_id, _NOTE, note)
 
 

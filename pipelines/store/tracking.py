@@ -181,7 +181,7 @@ def training_record(
         best = choice or choose(result, rule)
         expected = outlook(result, best)
         unit = unit_label(plain.get("unit", "um"))
-        name = f"{three_digits(best.S_mean_um)} ± {three_digits(best.S_std_um)} {unit} "
+        name = f"{three_digits(round(best.S_mean_um, 2))} ± {three_digits(round(best.S_std_um, 2))} {unit} "
         name += f"{best.family} {best.n_tsp} {best.selector}"  # MLflow's list shows the begin of a name
         metrics |= _cell_metrics(_judged_row(result, rule, best)) | {
             "nested_S_mean_um": best.nested_S_mean_um, "nested_S_std_um": best.nested_S_std_um,

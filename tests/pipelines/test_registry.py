@@ -159,7 +159,7 @@ def test_roll_back_goes_to_the_version_before_and_no_further(store):
         """Which trainings have the star of the champion in MLflow's list, the newest first, and the note's claim."""
         runs = client.search_runs([experiment], "tags.kind = 'training'")
         note = client.get_experiment(experiment).tags["mlflow.note.content"]
-        return [r.info.run_name.startswith("★ ") for r in runs], note.partition(". ")[2].partition(",")[0]
+        return [r.info.run_name.startswith("★ ") for r in runs], note.partition(",")[0]
 
     assert shown() == ([True, False], "★ Champion: version 2")
     back = registry.rollback("toy-back-z", store)
