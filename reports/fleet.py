@@ -49,7 +49,8 @@ def fleet_page(
         f"{count(len(alerts), 'alert')} on {len(alerted)} of {count(len(machines), 'machine')}."
         if alerts else f"No alert on {count(len(machines), 'machine')}."
     )  # fmt: skip
-    of = f"{count(len(rows), 'channel')}, {without or 'none'} without a champion"
+    champions = f"{without} without a champion" if without else "each with a champion"
+    of = f"{count(len(rows), 'channel')}, {champions}"
     of += f"; the last retraining of {count(len(failed), 'machine')} failed." if failed else "."
     unknown = tuple(f"{r['machine']} {r['channel']}: {r['unknown']}" for r in rows if r["unknown"])
     served = tuple(

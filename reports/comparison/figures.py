@@ -41,7 +41,9 @@ def logarithmic(ax: Axes, values_um: Sequence[float], axis: str = "y") -> None:
     """A logarithmic axis over the finite values above zero, with a few round ticks."""
     good = [v for v in values_um if math.isfinite(v) and v > 0] or [1.0]
     own = ax.yaxis if axis == "y" else ax.xaxis
-    ax.set(**{f"{axis}scale": "log", f"{axis}lim": (min(good) / 1.1, 1.1 * max(*good, 2 * min(good)))})
+    low, high = min(good), max(*good, 2 * min(good))
+    margin = (high / low) ** 0.05
+    ax.set(**{f"{axis}scale": "log", f"{axis}lim": (low / margin, high * margin)})
     own.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=6))
     own.set_major_formatter("{x:g}")
     ax.minorticks_off()
