@@ -175,6 +175,8 @@ def promote(new: Newcomer, settings: Settings, *, force: bool = False) -> Promot
         else:
             outcome, known = _register(client, name, champion, new, settings, force, begun), False
         if not known:
+            if outcome.champion_version == outcome.version:
+                mark_champion(client, new.training_id, str(outcome.version))
             record_promotion(client, new.training_id, outcome.as_dict())
         return outcome
 
@@ -555,7 +557,6 @@ def _crown(client: MlflowClient, name: str, version: str, why: str, training_id:
         client, name, version, action="promote", why=why, training_id=training_id, code_version=code_version(),
         forced=forced,
     )  # fmt: skip
-    mark_champion(client, training_id, version)
     _drop(client, name, CHALLENGER, PROVISIONAL)  # lost to an older champion, and stood in for one
 
 

@@ -216,6 +216,8 @@ def mark_champion(client: MlflowClient, training_id: str, version: str) -> None:
         if error.error_code not in ("RESOURCE_DOES_NOT_EXIST", "INVALID_PARAMETER_VALUE"):
             raise
         return  # the training is deleted for good; its version may still be champion
+    if run.info.lifecycle_stage != "active":
+        return
     experiment = client.get_experiment(run.info.experiment_id)
     for other in client.search_runs([run.info.experiment_id], f"attributes.run_name LIKE '{_STAR}%'"):
         client.set_tag(other.info.run_id, _NAME, str(other.info.run_name).removeprefix(_STAR))

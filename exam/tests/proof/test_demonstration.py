@@ -70,7 +70,7 @@ def test_it_is_sealed_answered_opened_and_written(tmp_path: Path) -> None:
     said = " ".join(re.sub(r"<[^>]+>", " ", panel).split())
     assert "SIMULATED" in said and "The foundation exchanges heat with the bed" in said and d.seal.digest in said
     assert "Heat to the floor at bed conductance 22 W/K (90 %: 18 to 27)" in said
-    assert "probability 97 %, extremely likely" in said and "6.0 → " in said and "noise 0.8 µm" in said
+    assert "probability 97 %, extremely likely" in said and "6.0 → " in said and "noise 0.80 µm" in said
     assert page.index("unsealed right") < page.index("<header") and "machine.yml" not in page
     again = demonstrate(7, out, effect="floor_sink", by=by("silent"))  # replaces, with another salt
     assert again.judgement.outcome == "missed" and again.seal.digest != d.seal.digest
