@@ -15,7 +15,7 @@ from data import guess
 from data.errors import InputError
 from data.groups import FILL_IN, Group, files_pattern, grouped, joint
 from data.guess import Guess, PositionGroup
-from data.machine import Form, Machine, Split, parse_machine
+from data.machine import MAX_NAME, Form, Machine, Split, parse_machine
 from data.recording import read_batches
 from data.rows import cut_runs
 from data.units import conversion, convert, quantity
@@ -37,7 +37,9 @@ class Shown:
     numbers: tuple[float, ...] = ()
 
 
-def drafted(files: Sequence[Path], form: Form | None = None) -> tuple[str, dict[str, list[Shown]], int]:
+def drafted(
+    files: Sequence[Path], form: Form | None = None, named: str = ""
+) -> tuple[str, dict[str, list[Shown]], int]:
     """YAML text of a machine file for recordings of one machine, the columns of the first file of each kind, and how
     many runs there are.
 
@@ -45,7 +47,8 @@ def drafted(files: Sequence[Path], form: Form | None = None) -> tuple[str, dict[
     `recording.joined` where names, sheets or time stamps show that they belong to the recordings, and else left out.
     Every guess carries a comment ``# guessed: why`` and stands in the channel's ``guessed`` list; what is doubtful is a
     comment ``# check: …`` at the beginning. Values are taken from up to 20 tables and their first 200 000 rows. `form`
-    overrides what is found of the files' layout. The draft is tried on the first recording.
+    overrides what is found of the files' layout. The machine is named by `named`, such as the stem of the machine
+    file; without it by the recordings' folder. The draft is tried on the first recording.
 
     Raises:
         InputError: no files, or none holds a table of numbers.
@@ -53,7 +56,7 @@ def drafted(files: Sequence[Path], form: Form | None = None) -> tuple[str, dict[
     if not files:
         raise InputError("describe: no files given, expected recordings of one machine; name at least one")
     groups, left_out = _belonging(*grouped(files, form))
-    text = _write(groups, left_out, {p.name for p in files} - {p.name for p in groups[0].paths})
+    text = _write(groups, left_out, {p.name for p in files} - {p.name for p in groups[0].paths}, named)
     machine = parse_machine(text.replace(FILL_IN, "1 s"), "draft")
     if FILL_IN not in text and (trouble := _tried(groups[0].paths[0], machine)):
         text = f"{CHECK}{trouble}\n{text}"
@@ -126,7 +129,7 @@ def _key(group: Group, taken: Sequence[str]) -> str:
     return name if name not in taken else f"{name}_{len(taken) + 1}"
 
 
-def _write(groups: Sequence[Group], left_out: Sequence[str], others: set[str]) -> str:
+def _write(groups: Sequence[Group], left_out: Sequence[str], others: set[str], named: str) -> str:
     main, *joined = groups
     linked = [_linked(g) for g in groups]
     channels: list[str] = []
@@ -135,7 +138,9 @@ def _write(groups: Sequence[Group], left_out: Sequence[str], others: set[str]) -
         channels += _channels(group, along, taken)
     runs = _runs(main)
     files = [p.name for p in main.paths]
-    folder = re.sub(r"[^a-z0-9_\-]+", "_", main.paths[0].resolve().parent.name.lower()).strip("_-") or "machine"
+    given = named or main.paths[0].resolve().parent.name
+    name = re.sub(r"[^a-z0-9_\-]+", "_", given.lower()).strip("_-")[:MAX_NAME] or "machine"
+    origin = "the name of this file" if named else "guessed: the folder's name"
     doubts = [(g, note) for g in groups for note in (g.clock.note, *g.notes) if note]
     patterns = [next((g.joint.files for g in joined if g.joint and g.joint.files), None) or files_pattern(main.paths)]
     if fnmatch.filter(others, patterns[0]):  # those are no recordings
@@ -145,7 +150,7 @@ def _write(groups: Sequence[Group], left_out: Sequence[str], others: set[str]) -
         f"# ({main.table.summary}). Look at every line marked 'guessed', correct it, and empty the guessed lists.",
         *(f"{CHECK}{f'{g.paths[0].name}: ' if joined else ''}{note}" for g, note in doubts),
         *(f"# left out: {line}" for line in left_out),
-        f"machine: {flow(folder)}  # guessed: the folder's name",
+        f"machine: {flow(name)}  # {origin}",
         *(["simulated: true  # a line of the file says so"] if main.table.simulated else []),
         "recording:",
         f"  files: {flow(patterns)}  # guessed: the names of the files",

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from data.batch import Batch, Finding
 from data.checks import check_batch, overruled
 from data.errors import InputError, WorkError
+from data.held import check_name
 from data.lake import Lake
 from data.lakefile import content_digest
 from data.machine import Machine
@@ -116,11 +117,13 @@ def ingest(
     quarantine. `progress` gets one line per file.
 
     Raises:
-        InputError: a path does not exist, or a channel's unit cannot be kept; nothing has been read then.
+        InputError: a path does not exist, a channel's unit cannot be kept, or the lake holds another machine under
+            this name (see `data.held.check_name`); nothing has been stored then.
         WorkError: the lake cannot be written; what was stored before stays.
     """
     check_canonical({n: (c.role, c.unit) for n, c in machine.channels.items()}, f"machine file {machine.machine}")
     files, ignored = _collect(paths, machine)
+    check_name(files, machine, lake)
     growing = _growing(files)
     run = _Run(machine, lake, IngestReport(machine.machine, ignored=ignored))
     for number, (file, folder) in enumerate(files.items(), 1):

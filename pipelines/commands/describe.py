@@ -189,7 +189,8 @@ def describe(
     from pipelines.settings import load
 
     keys = "\n".join(": ".join(text.split("=", 1)) for text in given or ())
-    text, columns, runs = drafted(files, parse_yaml(keys or "{}", Form, "describe --set"))
+    named = "" if to is None else to.stem
+    text, columns, runs = drafted(files, parse_yaml(keys or "{}", Form, "describe --set"), named)
     if show:
         for name, shown in columns.items():
             _print_columns(name, shown)

@@ -6,9 +6,10 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from data.batch import Batch, Channel
+from data.batch import Batch
 from data.checks import check_machine, checked
 from data.errors import InputError, closest
+from data.held import check_channels
 from data.ingest import IngestReport, id_prefix, ingest
 from data.lake import Lake
 from data.machine import Machine
@@ -47,38 +48,6 @@ def load_batches(lake: Lake, machine: Machine) -> list[Batch]:
     batches = lake.load_all(machine.machine)
     check_channels(batches, machine, lake)
     return check_machine(batches, machine)
-
-
-def check_channels(batches: Sequence[Batch], machine: Machine, lake: Lake) -> None:
-    """Whether stored batches have the channels of the machine file: names, roles, units and positions.
-
-    Raises:
-        InputError: some have others; the differences, and what to do.
-    """
-    now = {n: _meaning(c) for n, c in machine.batch_channels().items()}
-    stored = {b.batch_id: {n: _meaning(c) for n, c in b.channels.items()} for b in batches}
-    unfit = [i for i, channels in stored.items() if channels != now]
-    if not unfit:
-        return
-    then = [stored[i] for i in unfit]
-    changes = [
-        ("not stored", sorted({n for n in now if any(n not in c for c in then)})),
-        ("no longer in the machine file", sorted({n for c in then for n in c if n not in now})),
-        ("changed", sorted({f"{n} ({c[n]} → {now[n]})" for c in then for n in c if n in now and c[n] != now[n]})),
-    ]
-    what = "; ".join(f"{kind}: {', '.join(names)}" for kind, names in changes if names)
-    name, few = machine.machine, ", ".join(unfit if len(unfit) <= 4 else [*unfit[:3], "…"])
-    raise InputError(
-        f"machine file {name}: {len(unfit)} of {len(batches)} batches in the lake ({few}) have other channels; "
-        f"{what}; ingest their recordings again with this machine file, or where these are gone their copies in the "
-        f"lake (`thermodrift ingest {lake.name}/machine={name} --machine FILE`; a renamed channel is empty then), "
-        f"or withdraw them (`thermodrift lake withdraw {name} BATCH... --reason TEXT`)"
-    )
-
-
-def _meaning(channel: Channel) -> str:
-    along = f" along {channel.position}" if channel.position else ""
-    return f"{channel.role} in {channel.unit}{along}"
 
 
 def checked_files(

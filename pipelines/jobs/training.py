@@ -23,6 +23,7 @@ from data.account import Account
 from data.batch import Batch
 from data.checks import check_machine
 from data.errors import InputError, WorkError, place_of
+from data.held import check_channels
 from data.ingest import IngestReport, ingest
 from data.machine import Machine, load_machine
 from models.selection import promotion
@@ -35,7 +36,7 @@ from models.selection.trust import Region, left_out_runs
 from models.selection.updating import updated_scores
 from pipelines import stopping
 from pipelines.caller import RETRIES, DirectCaller, Say
-from pipelines.jobs.recordings import check_channels, home_lake, load_batches
+from pipelines.jobs.recordings import home_lake, load_batches
 from pipelines.jobs.request import TrainRequest, check_request
 from pipelines.settings import Settings, home
 from pipelines.store import registry, spool, tracking

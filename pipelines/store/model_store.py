@@ -130,8 +130,12 @@ class StoredModel:
         return out
 
     def distance(self, batch: Batch) -> Array:
-        """Distance of each row (n,) from the trained region, in trained widths; 0 inside."""
-        return self.region.distance(watched(batch, self.family.inputs))
+        """Distance of each row (n,) from the trained region, in trained widths; 0 inside, and where the region has no
+        quantity; NaN where the batch has none of them."""
+        values = watched(batch, self.family.inputs)
+        if not any(name in values for name in self.region.ranges):
+            return np.full(batch.n_rows, np.nan if self.region.ranges else 0.0)
+        return self.region.distance(values)
 
     def weight(self, distance: Array) -> Array:
         """The share of the correction (n,) that is sent at a distance from the trained region."""

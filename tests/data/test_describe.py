@@ -50,6 +50,17 @@ def draft_of(folder, table):
     return text, machine, next(read_batches(folder / "a.csv", machine))
 
 
+@pytest.mark.parametrize(
+    ("named", "name"), [("", "my_runs"), ("My Lathe 3", "my_lathe_3"), ("_", "machine"), ("m" * 99, "m" * 80)]
+)
+def test_the_machine_has_the_name_of_the_file_and_without_one_of_the_folder(tmp_path, named, name):
+    (tmp_path / "My Runs").mkdir()
+    run(0).to_csv(tmp_path / "My Runs" / "a.csv", index=False)
+    text = drafted([tmp_path / "My Runs" / "a.csv"], named=named)[0]
+    assert parse_machine(text, "draft").machine == name
+    assert f"machine: {name}  # {'the name of this file' if named else 'guessed'}" in text
+
+
 @pytest.mark.parametrize("suffix", ["csv", pytest.param("xlsx", marks=pytest.mark.slow), "parquet"])
 def test_draft_reads_the_files_it_was_drafted_from(tmp_path, suffix):
     files = []

@@ -149,6 +149,7 @@ def test_describe_drafts_a_file_that_ingests(
     draft = tmp_path / "draft.yml"
     done = call("describe", *files, "--out", draft)
     assert done.code == 0 and "a draft; check every line marked 'guessed'" in done.out
+    assert "\nmachine: draft  # the name of this file\n" in draft.read_text()
     again = call("describe", *files, "--out", draft)
     assert (again.code, lines(again.err)) == (
         2,

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from data.errors import InputError
@@ -140,6 +141,59 @@ def test_stored_batches_with_other_channels_are_one_line(
     assert words in told and "6 of 6 batches in the lake (20250114, 20250214, 20250314, …)" in told
     assert call("ingest", lake.root / f"machine={NAME}", "--machine", changed).code == 0
     assert len(load_batches(lake, load_machine(changed))) == 6
+
+
+def another_machine(folder: Path) -> tuple[Path, Path]:
+    """A machine file with the same name, and recordings with the same names of files and the same speeds."""
+    machine = write_machine(folder / "other.yml", NAME)
+    machine.write_text(machine.read_text().replace("  bed: ", "  column: "))
+    for file in write_year(folder / "in"):
+        table = pd.read_csv(file).rename(columns={"bed": "column"})
+        table.add([0, 1.5, 1.5, 1.5, 0, 3.0, 3.0]).to_csv(file, index=False)
+    return machine, folder / "in"
+
+
+@pytest.mark.parametrize("command", ["ingest", "train"])
+@pytest.mark.parametrize("month", ["", "07"])
+def test_another_machine_of_the_same_name_is_refused_before_anything_is_stored(
+    command: str, month: str, year: Path, call: Call, store_home: Path, tmp_path: Path
+) -> None:
+    machine, recordings = another_machine(tmp_path)
+    if month:
+        recordings = recordings.joinpath("20250114.csv").rename(tmp_path / f"2025{month}14.csv")
+    before = {p: p.read_bytes() for p in (store_home / "lake").rglob("*") if p.is_file()}
+    given = ("ingest", recordings) if command == "ingest" else ("train", "--recordings", recordings, "--direct")
+    done = call(*given, "--machine", machine)
+    assert (done.code, done.out) == (2, "") and "Traceback" not in done.err
+    assert (
+        f"machine file {NAME}: the lake holds 6 batches under this name, of which 6 have other channels (not stored: "
+        "column; no longer in the machine file: bed); nothing was stored. If they are of another machine, give this "
+        "one a name of its own (key machine);" in done.err
+    )
+    assert {p: p.read_bytes() for p in (store_home / "lake").rglob("*") if p.is_file()} == before
+    assert "batches unchanged: 6" in call("ingest", year / "in", "--machine", year / "small.yml").out
+
+
+def test_recordings_do_not_join_simulated_batches(year: Path, call: Call, tmp_path: Path) -> None:
+    machine = write_machine(tmp_path / "real.yml", NAME)
+    machine.write_text(machine.read_text().replace("simulated: true\n", ""))
+    (new,) = write_year(tmp_path / "in", 1, 7)
+    done = call("ingest", new, "--machine", machine)
+    assert done.code == 2 and "of which 6 are simulated, and the machine file's are recorded; nothing was" in done.err
+    assert "batches new version: 6" in call("ingest", year / "in", "--machine", machine).out
+    assert "batches new: 1" in call("ingest", new, "--machine", machine).out
+
+
+def test_recordings_come_again_with_new_ones_after_a_change_of_the_machine_file(
+    year: Path, call: Call, tmp_path: Path
+) -> None:
+    machine, _ = another_machine(tmp_path)
+    machine.write_text(machine.read_text().replace("{role: temperature", "{column: bed, role: temperature", 2).replace(
+        "front: {column: bed", "front: {column: front"))  # fmt: skip
+    (new,) = write_year(tmp_path / "later", 1, 7)
+    assert call("ingest", new, "--machine", machine).code == 2
+    assert "batches new version: 1" in call("ingest", year / "in" / "20250114.csv", "--machine", machine).out
+    assert "batches new version: 5, batches new: 1" in call("ingest", year / "in", new, "--machine", machine).out
 
 
 def test_a_lake_of_an_earlier_version_is_migrated_and_signed(

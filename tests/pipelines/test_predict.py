@@ -140,6 +140,21 @@ def test_rows_beyond_the_training_are_marked_with_what(stored):
     assert set(model.outside(model_store.frame_to_batch(model, cold))) == {"front@start"}
 
 
+@pytest.mark.parametrize(("trained", "distance"), [(["speed"], np.nan), ([], 0.0)])
+def test_a_model_without_inputs_predicts_a_run_without_drivers(trained, distance, tmp_path):
+    batches = toy_batches("toy-mean", 3)
+    channels = {n: c for n, c in batches[0].channels.items() if n != "speed"}
+    bare = [replace(b, table=b.table.drop(columns="speed"), channels=channels) for b in batches]
+    mean = FAMILIES["mean_curve"]().fit(batches, (), "z")
+    region = Region.of(batches if trained else bare, ())
+    assert list(region.ranges) == trained
+    model_store.save(tmp_path, mean, machine_yaml("toy-mean"), region)
+    table = predict_batches(model_store.load(tmp_path), bare[:1])
+    np.testing.assert_allclose(table["predicted_um"], np.mean([b.table["z"] for b in batches], axis=0))
+    np.testing.assert_array_equal(table["distance"], distance)
+    assert (table["authority"] == 1.0).all() and not table["outside_region"].any()
+
+
 @pytest.fixture
 def bounded(tmp_path) -> model_store.StoredModel:
     """A stored model with two of other families, whose left-out runs had S = 5 µm and a disagreement of 0.1 µm."""
