@@ -131,8 +131,10 @@ class FaultCost:
         said = f"a sensor that is wrong by 1 K costs up to {self.um_per_K[dearest]:.2g} µm ({dearest})"
         if not self.n:
             return f"{said}; no simulated fault of a sensor matters"
-        return f"{said}; the guard misses {self.missed} of {self.n} simulated faults, the dearest costs " \
-               f"{self.worst_um:.3g} µm ({self.worst})"  # fmt: skip
+        return (
+            f"{said}; {self.missed} of {self.n} simulated sensor faults are not detected, and the worst fault changes "
+            f"the correction by {self.worst_um:.3g} µm ({self.worst})"
+        )
 
     def as_plain(self) -> dict[str, Any]:
         return {**self.__dict__, "um_per_K": dict(self.um_per_K), "summary": self.summary}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from data.batch import Batch, Finding
-from data.checks import OF_CELLS, USER
+from data.checks import CHECKS, OF_CELLS, USER
 from data.checks.base import Bools, clock, overrule_line
 from data.recording import DROPPED
 
@@ -76,7 +76,8 @@ class Account:
         more = f" and {len(by) - 3} more channels" if len(by) > 3 else ""
         missing = sum(x.rows for x in self.lost if x.state == "missing")
         out = f"{self.rows}; {sum(by.values())} values masked" + (f": {named}{more}" if by else "")
-        return out + (f"; {missing} cells without a value" if missing else "")
+        out += f"; {missing} cells without a value" if missing else ""
+        return "; ".join([out, *map(_explained, dict.fromkeys(x.check for x in masked if x.channel in most))])
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON: totals, the summary and a row for each batch, channel and check."""
@@ -91,9 +92,8 @@ class Account:
         every = total / max(len({x.batch_id for x in mine}), 1) * self.batches
         if not rows or rows <= DECIDES * every:
             return ""
-        return (
-            f"{rows / every:.0%} of the rows of {channel} are masked ({', '.join(sorted({x.check for x in mine}))}). "
-        )
+        checks = "; ".join(map(_explained, sorted({x.check for x in mine})))
+        return f"{rows / every:.0%} of the rows of {channel} are masked ({checks}). "
 
     def large(self, batch_ids: Collection[str]) -> list[str]:
         """One line a channel and check that masks more than 5 % of the rows of a batch: how to lift or confirm it."""
@@ -114,6 +114,10 @@ class Account:
                 f"confirm it: {lift.replace(', reason', ', mask: true, reason')}"
             )
         return lines
+
+
+def _explained(check: str) -> str:
+    return f"{check}: {CHECKS[check].summary}" if check in CHECKS else check
 
 
 def _lost(batch: Batch) -> list[Lost]:

@@ -4,7 +4,6 @@ ingest stores recordings, which may be those of another machine of the same name
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -86,8 +85,7 @@ def _same_recordings(
     """Whether the first of these files that can be read has, in any channel, the values of a batch of its id."""
     for file, ids in again.items():
         try:
-            with closing(read_batches(file, machine, need_error=False)) as batches:
-                new = next(batches)
+            new = next(read_batches(file, machine, need_error=False))
         except (InputError, StopIteration):
             continue
         batch_id = files[file] + new.batch_id

@@ -318,14 +318,12 @@ def _count_rows(file: Path, machine: Machine) -> int | None:
             return int(pq.ParquetFile(file).metadata.num_rows)
         if file.suffix not in (".csv", ".txt", ".tsv"):
             return None
-        lines, last = 0, b"\n"
         with file.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                if b"\0" in block:
+            rows = 0
+            for line in stream:
+                if b"\0" in line:
                     return None
-                lines += block.count(b"\n")
-                last = block
-        lines += not last.endswith(b"\n")
-        return max(0, lines - machine.recording.header)
+                rows += bool(line.strip()) and not line.lstrip().startswith(b"#")
+        return max(0, rows - machine.recording.header)
     except (OSError, pa.ArrowException):
         return None

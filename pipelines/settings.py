@@ -119,13 +119,21 @@ def configure_environment() -> None:
     """Telemetry of mlflow and prefect off and PREFECT_HOME below `home()`; call it before prefect is imported.
 
     A PREFECT_HOME that the user set stays. Log levels are set when `pipelines` is imported.
+
+    Raises:
+        InputError: PREFECT_HOME is no folder and none can be made.
     """
     global _prefect_home_set_here
     os.environ.update(TELEMETRY_OFF)
     if os.environ.get("PREFECT_HOME", "") in ("", _prefect_home_set_here):
         _prefect_home_set_here = os.environ["PREFECT_HOME"] = str(home() / "prefect")
     # Prefect makes its folder but not the one above it; its server then stops without a message.
-    Path(os.environ["PREFECT_HOME"]).expanduser().mkdir(parents=True, exist_ok=True)
+    folder, name = Path(os.environ["PREFECT_HOME"]).expanduser(), "PREFECT_HOME"
+    name = "THERMODRIFT_HOME" if os.environ["PREFECT_HOME"] == _prefect_home_set_here else name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileNotFoundError, FileExistsError, NotADirectoryError) as error:
+        raise InputError(f"{folder}: no folder can be made there ({error.strerror}); let {name} name another") from None
 
 
 def load(path: Path | str | None = None) -> Settings:

@@ -229,7 +229,7 @@ class ErrorHeld(Check):
     """
 
     key = "error_held"
-    summary = "error channels held while the spindle stands"
+    summary = "all error channels repeat one value while the temperatures change"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         seen = signals(batch)

@@ -54,8 +54,9 @@ class Outlook:
 
     @property
     def headline(self) -> str:
-        """The warning, and the number with its bound."""
-        return "; ".join(p for p in (self.warning, self._number) if p)
+        """The warning, and the number with its bound; what the model itself left, where the number is more."""
+        choosing = f"with the cost of choosing a model, {self.cell_S_um:.2f} µm by this one alone" * self.nested
+        return "; ".join(p for p in (self.warning, self._number, choosing) if p)
 
     @property
     def _number(self) -> str:

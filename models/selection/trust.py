@@ -144,12 +144,10 @@ class Region:
         if name == PATTERN:
             return f"{PATTERN} unlike the training"
         low, high = self.ranges[name]
-        channel, _, kind = name.partition("@")
         known = values[name][np.isfinite(values[name])]
         value = known[np.argmax(_excess(known, low, high))]
-        rise = " rise" if not kind and self.units.get(name) == "K" else ""
-        what = f"{channel}{rise}{' at ' if kind == 'start' else ' ' if kind else ''}{kind}"
-        return f"{what} {value:.3g} {self.units.get(name, '')}, trained {low:.3g} to {high:.3g}"
+        unit = self.units.get(name, "")
+        return f"{quantity_label(name, unit)} {value:.3g} {unit}, trained {low:.3g} to {high:.3g}"
 
     def as_plain(self) -> dict[str, Any]:
         """Everything as numbers, strings, lists and arrays."""
@@ -163,6 +161,13 @@ class Region:
         ranges = {name: (float(low), float(high)) for name, (low, high) in plain["ranges"].items()}
         return cls(ranges, plain["units"], tuple(plain["points"]),
                    *(np.asarray(plain[k], float) for k in ("centre", "directions", "low", "high")))  # fmt: skip
+
+
+def quantity_label(name: str, unit: str = "") -> str:
+    """A watched quantity as text: "room at start", and in K "front rise"."""
+    channel, _, kind = name.partition("@")
+    rise = " rise" if not kind and unit == "K" else ""
+    return f"{channel}{rise}{' at ' if kind == 'start' else ' ' if kind else ''}{kind}"
 
 
 def worth(distance: Array | float, tested: float) -> Array:

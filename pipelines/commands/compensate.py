@@ -153,6 +153,8 @@ def rehearse(
     if as_json:
         console.print_json(rehearsal_dict(r) | {"page": str(page), "remarks": remarks, "account": account.as_dict()})
         return
+    if r.simulated:
+        console.line("SIMULATED recordings")
     console.line(account.summary)
     for a, remark in remarks.items():
         console.line(f"{a:<10} {remark}")
@@ -166,8 +168,8 @@ def rehearse(
 
 
 def export(
-    to: Annotated[str, typer.Option("--to", help="receiver, c, st, onnx, json or sinumerik")],
     models: OrModels = None,
+    to: Annotated[str, typer.Option("--to", help="receiver, c, st, onnx, json or sinumerik")] = "c",
     model: Named = None,
     out: Annotated[Path | None, typer.Option("--out", help="folder; default: var/export/MACHINE")] = None,
     max_um: MaxOffset = None,

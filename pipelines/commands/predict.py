@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from pipelines.store.model_store import StoredModel
 
 _NAMED = 3  # flagged runs in the summary line
+_STATED = ("expected_S_um", "expected_S_bound90_um", "expected_S_alone_um")  # by the training, kept with the model
 
 
 def load_model(model_uri: str, settings: Settings) -> StoredModel:
@@ -130,8 +132,12 @@ def predict_batches(model: StoredModel, batches: Iterable[Batch]) -> pd.DataFram
             "authority": model.weight(distance),
             **run._asdict(), "unit": unit, "simulated": model.simulated or batch.simulated, "standing": model.standing,
         }))  # fmt: skip
+    if not tables:
+        return None
     names = {n: error_column(n, unit) for n in ("predicted_um", "expected_S_um", "bound90_S_um")}
-    return pd.concat(tables, ignore_index=True).rename(columns=names) if tables else None
+    table = pd.concat(tables, ignore_index=True).rename(columns=names)
+    table.attrs["training"] = {k: float(model.info[k]) for k in _STATED if k in model.info}
+    return table
 
 
 def summary(table: pd.DataFrame) -> str:
@@ -140,6 +146,7 @@ def summary(table: pd.DataFrame) -> str:
     Args:
         table: of `predict_batches`.
     """
+    from models.selection.trust import quantity_label
     from reports.labels import count
 
     unit = str(table["unit"].iloc[0])
@@ -147,6 +154,7 @@ def summary(table: pd.DataFrame) -> str:
     runs = runs.rename(columns={error_column(c, unit): c for c in ("expected_S_um", "bound90_S_um")})
     expected, most = (_between(runs[c]) for c in ("expected_S_um", "bound90_S_um"))
     number = f"expect S {expected}, 90 % below {most}" if expected else "no expected error is stored; train again"
+    stated = _stated(table.attrs.get("training", {})) if expected else ""
     parts = [f"{count(len(runs), 'run')}: {number}"]
     if (standing := table["standing"].iloc[0]) != "champion":
         parts.insert(0, f"{standing} model")
@@ -157,9 +165,22 @@ def summary(table: pd.DataFrame) -> str:
     if len(flagged) > _NAMED:
         parts.append(f"and {len(flagged) - _NAMED} more, see column flagged")
     if (rows := table["outside_region"]).any():
-        names = dict.fromkeys(n for text in table.loc[rows, "outside_of"].unique() for n in text.split(", "))
+        every = (n for text in table.loc[rows, "outside_of"].unique() for n in text.split(", "))
+        names = dict.fromkeys(map(quantity_label, every))
         parts.append(f"{rows.sum()} of {len(rows)} rows are outside the trained range ({', '.join(names)})")
-    return in_error_unit(("warning: " if len(parts) > 1 else "") + "; ".join(parts), unit)
+    warns = "warning: " if len(parts) > 1 else ""
+    return in_error_unit(f"{warns}{'; '.join(parts)}{stated}", unit)
+
+
+def _stated(training: Mapping[str, float]) -> str:
+    """What the training stated, which is of another model or of any run; "" where the model keeps none."""
+    S_um, bound_um, alone_um = (training.get(k, math.nan) for k in _STATED)
+    if not math.isfinite(S_um):
+        return ""
+    choosing = f", with the cost of choosing a model ({alone_um:.2g} µm by this one alone)" * (S_um > alone_um)
+    return (
+        f". The training stated for any run of the next season S {S_um:.2g} µm, 90 % below {bound_um:.2g} µm{choosing}"
+    )
 
 
 def _between(values_um: pd.Series) -> str:
@@ -192,5 +213,7 @@ def predict(
     else:
         of_names = {"batch_id": table["batch_id"].map(as_cell)}
         table.assign(**of_names).to_csv(sys.stdout if to is None else to, index=False)
+    if table["simulated"].any():
+        console.note("SIMULATED model or recordings")
     console.note(summary(table))
     console.note(table.attrs["account"]["summary"])

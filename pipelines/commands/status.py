@@ -26,7 +26,8 @@ ALERT_CODE = 3
 
 
 def print_fleet(view: FleetView) -> None:
-    """A table that fits into 80 columns, the alerts, and what is not known; nothing where there is no machine."""
+    """A table that fits into 80 columns, with long names in several lines, the alerts, and what is not known; nothing
+    where there is no machine."""
     if not view.rows:
         return
     from rich.table import Table
@@ -37,7 +38,7 @@ def print_fleet(view: FleetView) -> None:
         ("", "left", 1), ("machine", "left", 17), ("", "left", 4), ("champion", "left", 14), ("seen to", "left", 10),
         ("expect µm", "right", 11), ("newer", "right", 7), ("out", "right", 3), ("next", "left", 5),
     ):  # fmt: skip
-        table.add_column(name, justify=side, max_width=width, no_wrap=True, overflow="ellipsis")  # type: ignore[arg-type]
+        table.add_column(name, justify=side, max_width=width, overflow="fold")  # type: ignore[arg-type]
     for r in view.rows:
         table.add_row(*_cells(r))
     console.out.print(table)

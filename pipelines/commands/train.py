@@ -95,7 +95,9 @@ def _sentence(outcome: TrainOutcome, target: str) -> str:
     elif promotion.outcome == "unchanged":
         parts.append(promotion.summary)
     else:
-        parts.append(f"{promotion.name} version {promotion.version} is {promotion.outcome}")
+        uri = f"models:/{promotion.name}" if promotion.outcome == "provisional" else promotion.model_uri
+        usable = f" (--model {uri})" if promotion.champion_version is None else ""
+        parts.append(f"{promotion.name} version {promotion.version} is {promotion.outcome}{usable}")
     return f"{target}: {'; '.join(parts)}"
 
 

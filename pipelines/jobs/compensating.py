@@ -22,7 +22,7 @@ from data.batch import Batch
 from data.errors import InputError
 from features.rises import feature_unit
 from pipelines.settings import home
-from pipelines.store.model_store import FILES, StoredModel, inner_folder, is_champion, load
+from pipelines.store.model_store import FILES, StoredModel, inner_folder, is_champion, load, registered
 
 PERIOD_S = 10.0  # of the models: castings move in minutes, and a step costs a tenth of a millisecond
 _LOST_SAMPLES = 3  # in a row before the input is stale
@@ -74,11 +74,18 @@ def check_standing(models: Mapping[str, StoredModel], provisional: bool) -> None
                 f"{bound_um:.2g} µm; add --provisional to accept that, or train on more runs"
             )
         if m.standing == "refused" and not is_champion(name):
+            training = m.info.get("training_id") or "TRAINING"
             raise InputError(
                 f"model {name} is refused: {m.info.get('caution') or 'not shown to be better than no model'}; train on "
-                "more runs; `thermodrift promote --force` makes it the champion all the same, and "
-                "models:/NAME@champion then acts with its whole correction"
+                f"more runs, or make it the champion all the same, which acts with its whole correction: `thermodrift "
+                f"promote {training} --machine FILE.yml --force`, then --model models:/{_name(name)}"
             )
+
+
+def _name(model: str) -> str:
+    """The registered name of a model as it was given; NAME of another form."""
+    named = registered(model)
+    return "NAME" if named is None else named[0]
 
 
 def compensator(

@@ -239,7 +239,7 @@ def _register(
     if champion is not None:
         comparison, obstacle, why = _against(champion, new.result, choice, settings, new.batches)
     if choice.standing == PROVISIONAL:
-        why = f"better than no model, not shown beyond doubt; {choice.authority:g} of the correction is supported"
+        why = f"better than no model, not shown beyond doubt; it sends {choice.authority:g} of its correction"
     elif not choice.trusted:
         why = "no trustworthy model"
     budget_um, faults = settings.promotion.fault_budget_um, new.faults
@@ -296,7 +296,7 @@ def _info(new: Newcomer) -> dict[str, Any]:
     choice, result, expected = new.choice, new.result, new.outlook
     return {
         "expected_S_um": expected.S_um, "expected_S_bound90_um": expected.bound_um, "expected_by": expected.protocol,
-        "leave_batch_out_S_mean_um": expected.leave_batch_out_um,
+        "expected_S_alone_um": expected.cell_S_um, "leave_batch_out_S_mean_um": expected.leave_batch_out_um,
         "leave_batch_out_S_std_um": expected.leave_batch_out_std_um, "expected": expected.summary,
         "training_id": new.training_id, "cell": choice.cell, "n_batches": len(result.batches),
         "simulated": result.simulated, "score_um": choice.score_um, "choice": choice.summary,
@@ -441,11 +441,12 @@ def find_version(client: MlflowClient, name: str, which: str) -> ModelVersion:
     versions = {str(v.version): v for v in model_versions(client, name)}
     if which == CHAMPION and versions:
         newest, provisional = next(iter(versions.values())), model.aliases.get(PROVISIONAL)
-        usable = f"; version {provisional} is provisional: models:/{name}@{PROVISIONAL}" if provisional else ""
-        raise InputError(
-            f"model {name!r} has no champion: {newest.tags.get('reason', 'none was promoted')}; name a version "
-            f"({', '.join(versions)}), or promote one by force{usable}"
-        )
+        usable = f"`predict` and `rehearse` take any version, such as --model models:/{name}/{newest.version}"
+        if provisional:
+            usable = (
+                f"`predict`, `rehearse` and `export` take provisional version {provisional}: --model models:/{name}"
+            )
+        raise InputError(f"model {name!r} has no champion: {newest.tags.get('reason', 'none was promoted')}; {usable}")
     if which not in versions:
         kind = "version" if which.isdigit() else "alias"
         raise InputError(f"model {name!r} has no {kind} {which!r}; {closest(which, [*model.aliases, *versions])}")

@@ -29,9 +29,10 @@ def test_the_account_says_what_was_taken_from_which_channel_by_which_check() -> 
     (lost,) = account.lost
     assert (lost.batch_id, lost.channel, lost.check, lost.state) == ("b00", "x", "jump_no_return", "masked")
     assert (lost.rows, lost.start_s) == (n - 30, 30 * STEP_S)
-    assert account.summary == f"rows: 500 read, 7 dropped; {n - 30} values masked: x {n - 30} (jump_no_return)"
+    why = "jump_no_return: a step of one channel that noise, drivers and the other channels do not explain"
+    assert account.summary == f"rows: 500 read, 7 dropped; {n - 30} values masked: x {n - 30} (jump_no_return); {why}"
     assert account.as_dict()["lost"][0]["rows"] == n - 30
-    assert account.warning("x").startswith(f"{(n - 30) / n:.0%} of the rows of x are masked (jump_no_return)")
+    assert account.warning("x").startswith(f"{(n - 30) / n:.0%} of the rows of x are masked ({why})")
     assert account.warning("z") == ""
 
 

@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 
 from data.files import write_atomic
+from pipelines.commands.status import print_fleet
 from pipelines.fleet import alerts, fleet_state
-from pipelines.fleet.alerts import alerts_of, machine_alerts
+from pipelines.fleet.alerts import FleetView, alerts_of, machine_alerts
 from pipelines.fleet.fleet_file import AlertRules, Fleet, FleetMachine
 from pipelines.fleet.watching import SCHEMA
 
@@ -200,3 +201,16 @@ def test_an_address_that_hangs_is_given_up(hook: Hook, monkeypatch: pytest.Monke
     monkeypatch.setattr(_Handler, "do_POST", lambda self: go.wait(30))
     assert "timed out" in alerts.post(hook.url, {}, timeout_s=0.2)
     go.set()
+
+
+def test_long_names_are_whole_in_the_table_of_status(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    unknown = ("expected_S_um", "bound90_S_um", "newer_S_mean_um", "provisional", "next_run", "outside_runs", "of_runs")
+    row = {"machine": "q" * 40, "channel": "k" * 12, "version": 3, "family": "y" * 30, "alerts": [], "last_seen": "",
+           "unknown": "", **dict.fromkeys(unknown)}  # fmt: skip
+    print_fleet(FleetView([row], [], []))
+    table = capsys.readouterr().out.partition("expect: ")[0]
+    assert [table.count(letter) for letter in "qky…"] == [40, 12, 30, 0]
+    assert max(map(len, table.splitlines())) <= 80

@@ -309,6 +309,27 @@ def test_describe_writes_into_a_new_folder_or_says_why_not(place: Place) -> None
         assert code == 2 and len(trouble(err)) < 200
 
 
+@pytest.mark.parametrize("home", ["/proc/nope", "{}/small.yml"])
+@pytest.mark.parametrize("command", [["status"], ["train", "--recordings", "{}/in", "--machine", "{}/small.yml"]])
+def test_a_home_that_cannot_be_made_is_one_line(
+    place: Place, monkeypatch: pytest.MonkeyPatch, home: str, command: list[str]
+) -> None:
+    write_year(place.folder / "in", 1)
+    monkeypatch.delenv("PREFECT_HOME", raising=False)
+    monkeypatch.setenv("THERMODRIFT_HOME", home.format(place.folder))
+    code, out, err = place.call(*(part.format(place.folder) for part in command))
+    assert (code, out) == (2, "")
+    assert re.match(
+        r"/.*/prefect: no folder can be made there \(.*\); let THERMODRIFT_HOME name another$", trouble(err)
+    )
+
+
+def test_comments_and_blank_lines_are_no_rows(place: Place) -> None:
+    (place.folder / "a.csv").write_text("# logger 7\n\ntime_s,front,bed,room,speed,x,z\n\n")
+    done = place.call("ingest", place.folder / "a.csv", "--machine", place.machine, "--json")
+    assert json.loads(done.out)[0]["rows_in"] == 0
+
+
 def test_describe_of_what_is_no_file(place: Place) -> None:
     code, _, err = place.call("describe", place.folder / "gone.csv")
     assert (code, trouble(err)) == (2, "gone.csv: no such file; give the path of a recording")

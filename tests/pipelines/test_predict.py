@@ -178,6 +178,16 @@ def test_a_run_has_one_expected_error_one_bound_and_one_line(bounded):
     assert re.fullmatch(r"3 runs: expect S [\d.]+ µm, 90 % below [\d.]+ µm", line)
 
 
+@pytest.mark.parametrize(
+    ("alone_um", "choosing"), [(9.0, ""), (2.0, ", with the cost of choosing a model (2 µm by this one alone)")]
+)
+def test_what_the_training_stated_stands_next_to_what_the_run_may_expect(bounded, alone_um, choosing):
+    stated = {"expected_S_um": 9.0, "expected_S_bound90_um": 20.0, "expected_S_alone_um": alone_um}
+    line = summary(predict_batches(replace(bounded, info=stated), toy_batches("toy-bound", 1)))
+    assert re.match(r"1 run: expect S [\d.]+ µm, 90 % below [\d.]+ µm\. The training stated", line)
+    assert line.endswith(f"for any run of the next season S 9 µm, 90 % below 20 µm{choosing}")
+
+
 def test_a_run_unlike_the_training_is_flagged_with_the_reason_and_expected_to_be_worse(bounded):
     usual, hot = toy_batches("toy-bound", 2)
     hot = replace(hot, table=hot.table.assign(front=hot.table["front"] + 25, bed=hot.table["bed"] + 25))
@@ -190,7 +200,7 @@ def test_a_run_unlike_the_training_is_flagged_with_the_reason_and_expected_to_be
     line = summary(table)
     assert re.match(r"warning: 2 runs: expect S [\d.]+ to [\d.]+ µm, 90 % below [\d.]+ to [\d.]+ µm; ", line)
     assert f"run {hot.batch_id} is unlike the training ({runs['flagged'].iloc[1]}): error may exceed" in line
-    assert "60 of 120 rows are outside the trained range (front@start, bed@start" in line
+    assert "60 of 120 rows are outside the trained range (front at start, bed at start" in line
 
 
 def test_rows_of_a_broken_sensor_are_not_predicted_and_the_account_names_it(stored, tmp_path):
@@ -228,8 +238,10 @@ def test_the_command_warns_on_standard_error_and_succeeds(stored, tmp_path):
     table.assign(front=table["front"] + 30).to_csv(tmp_path / "hot.csv", index=False)
     done = CliRunner().invoke(app, ["predict", str(tmp_path / "hot.csv"), "--model", str(stored)])
     assert done.exit_code == 0
-    assert done.stderr.startswith("warning: 1 run: no expected error is stored; train again; run hot is unlike")
-    _, account = done.stderr.strip().splitlines()
+    assert done.stderr.startswith(
+        "SIMULATED model or recordings\nwarning: 1 run: no expected error is stored; train again; run hot is unlike"
+    )
+    _, _, account = done.stderr.strip().splitlines()
     assert account == "rows: 60 read, 0 dropped; nothing masked"
     assert pd.read_csv(StringIO(done.stdout))["flagged"].notna().all()
 

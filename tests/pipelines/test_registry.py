@@ -237,7 +237,8 @@ def test_a_choice_that_is_not_to_be_trusted_says_so(store):
     assert aliases(store, "toy-zero-z") == {"challenger": 1}
     row = registry.status(store).set_index("name").loc["toy-zero-z"]
     assert not row["trusted"] and row["reason"] == "no trustworthy model, nothing beats zero (best other: 9.00 µm)"
-    with pytest.raises(InputError, match="has no champion: no trustworthy model, nothing beats zero"):
+    told = r"has no champion: no trustworthy model, nothing beats zero .* such as --model models:/toy-zero-z/1$"
+    with pytest.raises(InputError, match=told):
         registry.find_version(client_of(store), "toy-zero-z", "champion")
     again = registry.promote(new, store)
     assert (again.outcome, again.version, again.champion_version) == ("unchanged", 1, None)
@@ -265,9 +266,14 @@ def test_a_provisional_version_stands_in_until_there_is_a_champion(store):
     assert (refused.outcome, refused.standing) == ("challenger", "refused")
     first = train(store, "toy-maybe", [5.0] * 6, **PROVISIONAL)  # the same data, judged by another rule
     assert (first.outcome, first.version, first.champion_version) == ("provisional", 2, None)
-    assert "version 2 is provisional: better than no model, not shown beyond doubt; 0.6 of the" in first.summary
+    assert (
+        "version 2 is provisional: better than no model, not shown beyond doubt; it sends 0.6 of its correction"
+        in first.summary
+    )
     assert train(store, "toy-maybe", [5.0] * 6, **PROVISIONAL).outcome == "unchanged"
-    with pytest.raises(InputError, match=r"has no champion: .*; version 2 is provisional: models:/toy-maybe-z@prov"):
+    with pytest.raises(
+        InputError, match=r"has no champion: .*take provisional version 2: --model models:/toy-maybe-z$"
+    ):
         registry.find_version(client, name, "champion")
     assert train(store, "toy-maybe", [5.0] * 7, **PROVISIONAL).outcome == "provisional"
     assert aliases(store, name) == {"challenger": 1, "provisional": 3}
@@ -296,11 +302,17 @@ def test_a_name_alone_is_the_provisional_version_until_there_is_a_champion(store
         done = call(*command, "--model", "models:/toy-name-z")
         named = [line for line in (done.out + done.err).splitlines() if "provisional model" in line]
         assert done.code == 0 and len(named) == 1, done
+        if command[0] != "export":
+            assert (done.err if command[0] == "predict" else done.out).startswith("SIMULATED ")
         done = call(*command, "--model", "models:/toy-name-z@champion")
         assert (done.code, done.out) == (2, "")
-        lacking = r"better than no model, not shown beyond doubt; 0\.6 of the .*, not shown to be better than zero"
-        assert re.search(rf"has no champion: {lacking}; name a version \(1\).*; version 1 is provisional", done.err)
-    assert call("export", "models:/toy-name-z", "--to", "json", "--out", "again").code == 0
+        lacking = (
+            r"better than no model, not shown beyond doubt; it sends 0\.6 of its .*, not shown to be better than zero"
+        )
+        usable = "`predict`, `rehearse` and `export` take provisional version 1: --model models:/toy-name-z\n"
+        assert re.search(f"has no champion: {lacking}; {usable}", done.err)
+    assert call("export", "models:/toy-name-z", "--out", "again").code == 0
+    assert [p.suffix for p in sorted(Path("again").iterdir())] == [".c", ".h"], "C without --to"
     done = call("compensate", "models:/toy-name-z", "--from", "in/run.csv", "--replay")
     assert done.code == 2 and "is provisional: better than no model in most" in done.err
     done = call("export", "--to", "json")

@@ -246,8 +246,10 @@ def test_few_runs_are_counted_and_the_largest_error_comes_first(
     assert [s.index(f" A{few[1:]}. ") < s.index("stay below") for s in sentences] == [True, True]
     details = (tmp_path / "r.txt").read_text()
     assert details.count("* ridge") == 2 and details.index("small-few z") < details.index("small-few x")
-    with pytest.raises(InputError, match=f"has no champion: .*{few}; name a version"):
+    with pytest.raises(InputError, match=f"has no champion: .*{few}; `predict`") as refused:
         load_model("models:/small-few-z@champion", store)
+    usable = str(refused.value).rpartition("--model ")[2]
+    assert load_model(usable, store).family.target == "z" and f"(--model {usable})" in first
 
 
 def test_a_batch_without_a_usable_target_does_not_train_for_ever(home: Path, store: Any, tmp_path: Path) -> None:
