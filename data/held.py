@@ -52,17 +52,17 @@ def check_name(files: Mapping[Path, str], machine: Machine, lake: Lake) -> None:
     """
     name = machine.machine
     stems = {f: prefix + f.stem for f, prefix in files.items() if native_parquet(f) is None}
-    if not stems or not lake.batch_ids(name):
+    try:
+        if not stems or not lake.batch_ids(name):
+            return
+        held = {i: v[-1] for i, v in lake.contents(name).items() if v[-1].withdrawn is None}
+        newest = lake.load(name, max(held, key=lambda i: held[i].stored_at))
+        unfit = _unfit(lake.load_all(name), machine) if _unfit([newest], machine) else []
+    except WorkError:  # a damaged file is healed by the ingest, which says what else is wrong
         return
-    held = {i: v[-1] for i, v in lake.contents(name).items() if v[-1].withdrawn is None}
     other_kind = [
         i for i, v in held.items() if v.simulated != machine.simulated and not v.source.lower().endswith(_PARQUET)
     ]
-    try:
-        newest = lake.load(name, max(held, key=lambda i: held[i].stored_at))
-        unfit = _unfit(lake.load_all(name), machine) if _unfit([newest], machine) else []
-    except WorkError:  # a damaged file is healed by the ingest
-        return
     wrong = {b.batch_id for b in unfit} | set(other_kind)
     again = {f: [i for i in held if i == stem or i.startswith(f"{stem}-")] for f, stem in stems.items()}
     whole = wrong <= {i for ids in again.values() for i in ids} or all(again.values())

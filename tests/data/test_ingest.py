@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 import data.ingest
-from data.batch import Batch, Channel, Finding
+from data.batch import Batch, Finding
 from data.errors import InputError, WorkError
 from data.ingest import COLUMNS, IngestReport, ingest
 from data.lake import Lake
@@ -37,8 +37,8 @@ def fake_batches(path: Path, machine: Machine) -> Iterator[Batch]:
         if line == "?":
             raise ValueError("first\nsecond")
         name, value, rows, dropped = line.split(",")
-        table = pd.DataFrame({"time_s": np.arange(3) * 60.0, "T1": float(value)})
-        channels = {"T1": Channel("T1", "temperature", "degC")}
+        table = pd.DataFrame({"time_s": np.arange(3) * 60.0, "T1": float(value), "z_um": np.nan})
+        channels = machine.batch_channels()
         repairs = {"rows_in": int(rows), "rows_dropped": int(dropped)}
         yield Batch(machine.machine, name, table, channels, source=str(path), repairs=repairs)
 
