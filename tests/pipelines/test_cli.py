@@ -119,7 +119,7 @@ def test_predict_from_another_folder(year: Path, call: Call, tmp_path: Path, mon
     table.drop(columns=["x", "z"]).to_csv("run.csv", index=False)
     done = call("predict", "--model", f"models:/{NAME}-z@champion", "run.csv")
     assert done.code == 0 and [line.partition(" S ")[0] for line in lines(done.err)] == [
-        "1 run: expect", "rows: 73 read, 0 dropped; nothing masked",
+        "SIMULATED model or recordings", "1 run: expect", "rows: 73 read, 0 dropped; nothing masked",
     ]  # fmt: skip
     got = pd.read_csv(StringIO(done.out))
     assert np.abs(got["predicted_um"] - law_um(table)).max() < 1.5

@@ -243,7 +243,7 @@ def test_few_runs_are_counted_and_the_largest_error_comes_first(
     assert first.startswith("z: ") and second.startswith("x: ") and few in first and few in second
     assert list(training_dict(outcome)["expected"]) == ["z", "x"]
     sentences = re.findall(r'<p class="lead">(.*?)</p>', (tmp_path / "r.html").read_text())
-    assert [s.index(f" A{few[1:]}. ") < s.index("stay below") for s in sentences] == [True, True]
+    assert [f" A{few[1:]}." in s for s in sentences] == [True, True]
     details = (tmp_path / "r.txt").read_text()
     assert details.count("* ridge") == 2 and details.index("small-few z") < details.index("small-few x")
     with pytest.raises(InputError, match=f"has no champion: .*{few}; `predict`") as refused:
