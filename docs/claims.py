@@ -54,7 +54,7 @@ def made(name: str) -> str:
 
 def proof(page: str) -> tuple[dict[str, tuple[str, str, int]], str]:
     """The first result of a published proof: share, 90 % interval and n by measure; and the version that answered."""
-    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+    text = (ROOT / "exam" / "results" / f"{page}.md").read_text(encoding="utf-8")
     rows = re.search(r"^\| measure \| goal \| all plants.*?\n\n", text, re.DOTALL | re.MULTILINE)
     version = re.search(r"opened [^,]*, thermodrift (\S+)", text)
     assert rows and version

@@ -1,4 +1,4 @@
-"""What a sealed run writes into docs/proof.md: its result between two markers, and nothing else."""
+"""What a sealed run writes into exam/results/proof.md: its result between two markers, and nothing else."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from thermodrift_exam.proof.report.markdown import BEGIN, END, proof_markdown, p
 from thermodrift_exam.proof.report.tables import ProofRun
 from thermodrift_exam.proof.scoring.tables import SILENT
 
-DOCS = Path(__file__).parents[3] / "docs" / "proof.md"
+PAGE = Path(__file__).parents[2] / "results" / "proof.md"
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_the_command_publishes_what_it_opened(
 
 
 def test_the_docs_page_has_its_block() -> None:
-    text = DOCS.read_text(encoding="utf-8")
+    text = PAGE.read_text(encoding="utf-8")
     block = text.split(BEGIN)[1].split(END)[0]
     assert text.count(BEGIN) == text.count(END) == 1
     assert block.strip() == proof_markdown(None).strip() or "Sealed root: `" in block

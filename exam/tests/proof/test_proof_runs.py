@@ -15,7 +15,7 @@ from thermodrift_exam.proof.report.runs import FIGURES, GOAL_COLUMNS, RUN_COLUMN
 
 REPOSITORY = Path(__file__).parents[3]
 RECORD = REPOSITORY / "exam" / "thermodrift_exam" / "proof" / "runs" / "runs.csv"
-PAGES = [REPOSITORY / "docs" / name for name in ("proof.md", "proof_real.md")]
+PAGES = [REPOSITORY / "exam" / "results" / name for name in ("proof.md", "proof_real.md")]
 
 
 def goals_of(folder: Path, root: str) -> pd.DataFrame:

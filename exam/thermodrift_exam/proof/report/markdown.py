@@ -1,4 +1,4 @@
-"""The parts of docs/proof.md that an opened proof writes: its result, and the table of all sealed proofs."""
+"""The parts of exam/results/proof.md that an opened proof writes: its result, and the table of all sealed proofs."""
 
 from __future__ import annotations
 
