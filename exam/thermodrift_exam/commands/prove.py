@@ -182,7 +182,7 @@ def open_(
     proof: Proof,
     partial: Annotated[bool, typer.Option("--partial", help="also when cases have no answer; they stay void")] = False,
     publish: Annotated[
-        Path | None, typer.Option(help="Markdown page whose block of results is replaced, such as exam/results/proof.md")
+        Path | None, typer.Option(help="page whose block of results is replaced, as exam/results/proof.md")
     ] = None,
     workers: Workers = None,
     deals: Deals = 100,
