@@ -40,16 +40,15 @@ class Continued:
 
 
 def claim(x: Finding) -> tuple[str, str]:
-    """How sure a finding is; what is missing, where, when and how much, then what these runs cannot distinguish."""
-    tied: dict[str, float] = {}  # some differ in what their label leaves out
-    for o in x.alternatives:
-        if o.alike:
-            tied[tables.effect_label(o)] = tied.get(tables.effect_label(o), 0.0) + o.probability
+    """How sure a finding is; what is missing, where, when and how much, then what these runs cannot distinguish.
+
+    The probability is that of all of these together.
+    """
+    tied = list(dict.fromkeys(tables.effect_label(o) for o in x.alternatives if o.alike))
     own = [tables.effect_label(x), "" if x.when.regime == "always" else f"when {x.when.regime}", values_label(x)]
     text = ", ".join(filter(None, own))
     if tied:
-        names = [f"{label} ({tables.probability_label(p)})" for label, p in tied.items()]
-        text += f". These runs cannot distinguish it from {listed(names, MOST_PARAMETERS, 'or')}"
+        text += f"; or, which these runs cannot distinguish from it, {listed(tied, MOST_PARAMETERS, 'or')}"
     return f"{tables.probability_label(x.probability)}, {tables.likelihood(x.probability)}", f"{text}."
 
 
