@@ -48,6 +48,7 @@ from diagnosis.fitting.fitted import baseline
 from diagnosis.result import Diagnosis
 from diagnosis.search.claims import Round, indistinguishable
 from diagnosis.search.search import one_round
+from reports.diagnosis.tables import by_channel
 from thermodrift_exam.plants.plant import Case
 from thermodrift_exam.plants.real import recorded
 from thermodrift_exam.plants.withheld import CASES, build, cases
@@ -90,10 +91,8 @@ def of_withheld(name: str, data: str, out: str) -> dict[str, Any]:
         return dict(json.loads(path.read_text()))
     case, about = build(name, Path(data), seed=1), CASES[name]
     row = {"kind": about.machine, "seed": name, "what": about.kind, "terms": case.answer["terms"]}
-    hidden = {}
-    for channel in about.channels:
-        _, full = recorded(about.machine, Path(data), seed=1)
-        hidden = {b.batch_id: (b.time_s, b.values(channel)) for b in full}
+    _, full = recorded(about.machine, Path(data), seed=1)
+    hidden = {b.batch_id: (b.time_s, b.values(channel)) for channel in about.channels for b in full}
     return _diagnosed(path, row, case.machine, case.batches, case.answer, hidden=hidden)
 
 
@@ -193,11 +192,8 @@ def _proposed(
 
 def _left_out(done: Diagnosis) -> dict[str, Any]:
     """What is left of the error in runs left out once the findings are modelled, a share; channels count alike."""
-    rms = done.tables["rms"]
-    squared = (
-        rms.assign(before=rms["before"] ** 2, after=rms["after"] ** 2).groupby("channel")[["before", "after"]].mean()
-    )
-    return {"left_share": float(np.sqrt(squared["after"] / squared["before"]).mean())}
+    rms = by_channel(done.tables["rms"])
+    return {"left_share": float((rms["after"] / rms["before"]).mean())}
 
 
 def _recovered(done: Diagnosis, hidden: Mapping[str, tuple[Array, Array]]) -> dict[str, Any]:

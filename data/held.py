@@ -11,13 +11,12 @@ import numpy as np
 from data.batch import Batch, Channel
 from data.errors import InputError, WorkError
 from data.lake import Lake
-from data.lakefile import native_parquet
+from data.lakefile import PARQUET, native_parquet
 from data.machine import Machine
 from data.recording import read_batches
 
 _SHOWN = 3  # batches that a message names
 _SENSED = ("temperature", "ambient", "error")
-_PARQUET = (".parquet", ".pq")  # which say themselves whether they are simulated
 
 
 def check_channels(batches: Sequence[Batch], machine: Machine, lake: Lake) -> None:
@@ -60,8 +59,8 @@ def check_name(files: Mapping[Path, str], machine: Machine, lake: Lake) -> None:
         unfit = _unfit(lake.load_all(name), machine) if _unfit([newest], machine) else []
     except WorkError:  # a damaged file is healed by the ingest, which says what else is wrong
         return
-    other_kind = [
-        i for i, v in held.items() if v.simulated != machine.simulated and not v.source.lower().endswith(_PARQUET)
+    other_kind = [  # a Parquet file states itself whether it is simulated
+        i for i, v in held.items() if v.simulated != machine.simulated and not v.source.lower().endswith(PARQUET)
     ]
     wrong = {b.batch_id for b in unfit} | set(other_kind)
     again = {f: [i for i in held if i == stem or i.startswith(f"{stem}-")] for f, stem in stems.items()}

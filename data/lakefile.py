@@ -273,9 +273,12 @@ class NativeParquet:
         return replace(batch, batch_id=batch_id, start=start, labels=self.note["labels"])
 
 
+PARQUET = (".parquet", ".pq")  # suffixes
+
+
 def native_parquet(path: Path) -> NativeParquet | None:
     """Metadata of a Parquet file written by thermodrift; None for any other file, damaged ones included."""
-    if path.suffix.lower() not in (".parquet", ".pq"):
+    if path.suffix.lower() not in PARQUET:
         return None
     try:
         note = from_json((pq.read_schema(path).metadata or {})[META_KEY])

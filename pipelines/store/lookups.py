@@ -1,6 +1,6 @@
 """Models of the registry by name without MLflow, whose import alone takes longer than a prediction.
 
-The answers of the registry are kept below the home, and holds as long as the files of a SQLite store are the same. Of a
+The answers of the registry are kept below the home, and hold as long as the files of a SQLite store are the same. Of a
 store on a server, which may change unseen, and of models whose files are elsewhere, nothing is kept.
 """
 

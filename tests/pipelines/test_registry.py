@@ -237,8 +237,8 @@ def test_a_choice_that_is_not_to_be_trusted_says_so(store):
     assert aliases(store, "toy-zero-z") == {"challenger": 1}
     row = registry.status(store).set_index("name").loc["toy-zero-z"]
     assert not row["trusted"] and row["reason"] == "no trustworthy model, nothing beats zero (best other: 9.00 µm)"
-    told = r"has no champion: no trustworthy model, nothing beats zero .* such as --model models:/toy-zero-z/1$"
-    with pytest.raises(InputError, match=told):
+    lacking = r"has no champion: no trustworthy model, nothing beats zero .* such as --model models:/toy-zero-z/1$"
+    with pytest.raises(InputError, match=lacking):
         registry.find_version(client_of(store), "toy-zero-z", "champion")
     again = registry.promote(new, store)
     assert (again.outcome, again.version, again.champion_version) == ("unchanged", 1, None)

@@ -45,9 +45,9 @@ def test_kinds_add_up_and_each_is_within_one_of_its_share(cases: int) -> None:
 
 
 def test_320_cases_give_every_question_its_number() -> None:
-    told = {"nothing": 51, "decoy": 50, "one": 120, "two": 40, "three": 6, "confounded": 10, "unlisted": 40}
-    assert counts(320) == told | {"invisible": 3}
-    assert set(told) | {"invisible"} == set(KINDS)
+    expected = {"nothing": 51, "decoy": 50, "one": 120, "two": 40, "three": 6, "confounded": 10, "unlisted": 40}
+    assert counts(320) == expected | {"invisible": 3}
+    assert set(expected) | {"invisible"} == set(KINDS)
 
 
 def test_the_same_secret_gives_the_same_suite_and_another_shares_no_seed() -> None:
