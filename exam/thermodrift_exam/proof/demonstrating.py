@@ -136,9 +136,7 @@ def answered(case: Path, machine: Machine, by: Examinee, done: Done | None = Non
 
 def judged(diagnosis: Diagnosis, answer: Mapping[str, Any], machine: Machine) -> Judgement:
     """Score by the rules of the proof: right is the mechanism at its place or an adjacent one; all else is false."""
-    f = diagnosis.findings
-    of = {"schema": SCHEMA, "case": "demonstration", "kind": "one", "plant": "sample", "suite": "demonstration"}
-    key = AnswerKey.from_json({**of, **answer})
+    f, key = diagnosis.findings, key_of(answer)
     found = matches(f, key, bodies_of_sensors(machine))
     false = tuple(found.findings[n] for n in found.false)
     if not key.terms:
@@ -154,6 +152,12 @@ def judged(diagnosis: Diagnosis, answer: Mapping[str, Any], machine: Machine) ->
     if same is not None:
         return Judgement("other_place", same, tuple(x for x in false if x is not same))
     return Judgement("wrong" if false else "missed", None, false)
+
+
+def key_of(answer: Mapping[str, Any]) -> AnswerKey:
+    """The answer of a demonstration as a key of the proof."""
+    of = {"schema": SCHEMA, "case": "demonstration", "kind": "one", "plant": "sample", "suite": "demonstration"}
+    return AnswerKey.from_json({**of, **answer})
 
 
 def unsealed(
