@@ -47,6 +47,8 @@ class Policy:
     drawn_max_sd: float = convention(3.0, "sd of the prior", "a value farther out is none of this machine")
     drawn_value_log_sd: float = physical(0.2, "log", "effective values of lumps scatter as much")
     drawn_exponent_log_sd: float = physical(0.25, "log", "heat grows with speed by other powers than a law states")
+    left_out_shares: tuple[float, ...] = convention((1.0, 0.5, 0.25, 0.125), "of a step", "each half of the one before")
+    drawn_max_misfit: float = convention(10.0, "of the largest change recorded", "feedback of a draw that runs away")
     drawn_cells: tuple[int, int] = physical((3, 8), "cells", "of a body that is cut into a chain")
     drawn_length_centre: tuple[float, float] = physical((0.25, 0.75), "of a body", "where the mean of a length lies")
     inner_conductance: tuple[float, float] = physical(

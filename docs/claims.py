@@ -175,6 +175,7 @@ def control() -> str:
     stream, ends = rows[rows["what"] == "stream"].iloc[0], rows[rows["what"] != "stream"]
     assert not {"step", "size"} & set("; ".join(rows["broken"]).split("; ")), "state what was broken"
     assert int(ends["with_a_broken_invariant"].sum()) == 0, "state what was broken"
+    other = f" ({stream['broken'].replace('; ', ', ')})" if stream["broken"] else ""
     n, each = int(ends["n"].sum()), ", ".join(f"{r.what}: {r.n}" for r in ends.itertuples())
     moving = int(ends.loc[ends["what"] == "SIGKILL", "ended_while_moving"].sum())
     longest_s = ends["largest_active_after_s"].astype(float).max()
@@ -182,7 +183,7 @@ def control() -> str:
         f"In closed loop with the receiver of an export, version {about['version']}: in {stream['n']} hostile streams "
         f"({stream['samples']} samples, {stream['restarts']} restarts, simulated time) no step at the receiver was "
         f"above its limit and no correction beyond its size; {stream['with_a_broken_invariant']} of {stream['n']} "
-        f"streams broke another condition ({stream['broken'].replace('; ', ', ')}). In {n} ends of `compensate` "
+        f"streams broke another condition{other}. In {n} ends of `compensate` "
         f"({each}; {moving} of the kills by SIGKILL alone while the correction moved) nothing was broken, and each of "
         f"the {n} starts, from the state that an earlier process left, was active at most {longest_s:.0f} s after its "
         f"first sample, of which warm-up takes 60 (95 %: something breaks in at most {at_most(n)} of ends)."

@@ -100,10 +100,11 @@ _FIT = 2.5
 
 class Swapped(Check):
     """Each temperature has a fingerprint: start level and rises at four times, against the median of all sensors; each
-    driver the values that it is below in a twentieth, a half and nineteen twentieths of the rows.
+    driver of more than two values those that it is below in a twentieth, a half and nineteen twentieths of the rows.
 
-    Two channels are swapped in a batch where neither fits its own fingerprint of the other batches (4 robust
-    sigma rms) and each fits the other's (2.5 sigma).
+    Two channels are swapped in a batch where neither fits its own fingerprint (4 sigma rms) and each fits the other's
+    (2.5 sigma). A temperature's is the median of the batches, with their robust sigma. A driver follows a programme:
+    its is the range from the median lower to the median upper value, and sigma a tenth of that range.
     """
 
     key = "swapped"
@@ -113,14 +114,14 @@ class Swapped(Check):
         found: dict[int, list[Finding]] = {}
         if len(batches) < _BATCHES:
             return found
-        for roles, least, prints_of, least_spread in (
-            (THERMAL, 3, _fingerprints, lambda centre: np.array(_LEAST_SPREAD)), (("driver",), 2, _levels, _of_levels),
+        for roles, least, prints_of, usual in (
+            (THERMAL, 3, _fingerprints, _median), (("driver",), 2, _levels, _range),
         ):  # fmt: skip
             names = list(batches[0].names(*roles))
             if len(names) < least:
                 continue
             prints = np.array([prints_of(b, names) for b in batches])  # (K, p, f)
-            for k, i, j in _swaps(prints, least_spread):
+            for k, i, j in _swaps(prints, usual):
                 message = (
                     f"{names[i]} behaves as {names[j]} does in the other batches and the other way round: their plugs "
                     "or columns have changed places"
@@ -129,32 +130,43 @@ class Swapped(Check):
         return found
 
 
-def _swaps(prints: Array, least_spread: Callable[[Array], Array]) -> Iterator[tuple[int, int, int]]:
-    """Batch and both channels, in either order, of each swap in fingerprints (K, p, f), whose spread over the batches
-    counts as at least that of the median ones (p, f)."""
+def _swaps(prints: Array, usual: Callable[[Array], tuple[Array, Array, Array]]) -> Iterator[tuple[int, int, int]]:
+    """Batch and both channels, in either order, of each swap in fingerprints (K, p, f); `usual` gives what they are
+    compared with: least and largest value, and sigma, each (p, f)."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a channel that no batch has is all NaN
-        centre = np.nanmedian(prints, axis=0)
-        spread = np.maximum(1.4826 * np.nanmedian(np.abs(prints - centre), axis=0), least_spread(centre))
+        low, high, sigma = usual(prints)
     for k, own in enumerate(prints):
         # fit[i, j]: rms deviation of channel i from the fingerprint of channel j
-        z = (own[:, None, :] - centre[None]) / spread[None]
-        fit = np.sqrt(np.mean(np.minimum(np.abs(z), 30.0) ** 2, axis=2))
+        beyond = np.maximum(np.maximum(low[None] - own[:, None, :], own[:, None, :] - high[None]), 0.0)
+        fit = np.sqrt(np.mean(np.minimum(beyond / sigma[None], 30.0) ** 2, axis=2))
         bad = [i for i in range(len(own)) if np.isfinite(fit[i, i]) and fit[i, i] > _MISFIT]
         for i, j in combinations(bad, 2):
             if fit[i, j] < _FIT and fit[j, i] < _FIT:
                 yield from ((k, i, j), (k, j, i))
 
 
+def _median(prints: Array) -> tuple[Array, Array, Array]:
+    """Of temperatures: the median over the batches, and its robust sigma."""
+    centre = np.nanmedian(prints, axis=0)
+    return centre, centre, np.maximum(1.4826 * np.nanmedian(np.abs(prints - centre), axis=0), _LEAST_SPREAD)
+
+
 def _levels(batch: Batch, names: list[str]) -> Array:
-    """The values that each driver is below in 5, 50 and 95 % of the rows, (p, 3)."""
-    own = [batch.masked(n) if n in batch.channels else np.full(1, np.nan) for n in names]
-    return np.array([np.quantile(v[np.isfinite(v)], _SHARES) if np.isfinite(v).any() else [np.nan] * 3 for v in own])
+    """The values that each driver is below in 5, 50 and 95 % of the rows, (p, 3); NaN of a switch, whose two values say
+    nothing about which one it is."""
+    own = [batch.masked(n) if n in batch.channels else np.empty(0) for n in names]
+    own = [v[np.isfinite(v)] for v in own]
+    return np.array([np.quantile(v, _SHARES) if len(np.unique(v)) > 2 else [np.nan] * len(_SHARES) for v in own])
 
 
-def _of_levels(centre: Array) -> Array:
-    """A twentieth of the range of each channel's levels, (p, 1)."""
-    return np.asarray(0.05 * np.maximum(np.ptp(centre, axis=1), np.abs(centre).max(axis=1) * 0.1)[:, None] + 1e-12)
+def _range(prints: Array) -> tuple[Array, Array, Array]:
+    """Of drivers: the medians over the batches of the lowest and of the highest level, and a tenth of what is
+    between them, or of a tenth of their size."""
+    centre = np.nanmedian(prints, axis=0)
+    low, high = centre[:, :1], centre[:, -1:]
+    size = np.maximum(high - low, np.abs(centre).max(axis=1, keepdims=True) * 0.1)
+    return low, high, 0.1 * size + 1e-12
 
 
 def _fingerprints(batch: Batch, names: list[str]) -> Array:

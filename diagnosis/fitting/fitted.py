@@ -405,16 +405,35 @@ def left_out_rows(fitted: Fitted) -> LeftOutRows:
 
 
 def _left_out(one: Fitted) -> LeftOutRows:
-    problem, spread = one.problem, _spread(one.problem.unknowns)
-    blocks = list(problem.linearise(one.x, one.nuisance))
-    low, high = z_bounds(problem.unknowns)
+    blocks, (low, high) = list(one.problem.linearise(one.x, one.nuisance)), z_bounds(one.problem.unknowns)
     every_z = [np.clip(one.level.optimum(one.grams, b), low, high) for b in range(len(blocks))]
-    white = one.marginal.covariance.white
-    nuisance = [
-        v + nuisance_step(white(k, b.nuisance), v, white(k, b.residual - b.jacobian @ (spread * (z - one.z))))
-        for k, (b, v, z) in enumerate(zip(blocks, one.nuisance, every_z, strict=True))
-    ]
-    return _rows_left(problem, every_z, nuisance)
+    return _rows_left(
+        one.problem, [_predicted(one, k, b, z) for k, (b, z) in enumerate(zip(blocks, every_z, strict=True))]
+    )
+
+
+def _predicted(one: Fitted, k: int, block: Block, z: Array) -> Array:
+    """Residual (n_b,) of a batch at the values that the others give it. These follow from one linear step, which is
+    shortened where a machine of such values would run away.
+
+    Raises:
+        InputError: none of these can be simulated.
+    """
+    problem, white = one.problem, one.marginal.covariance.white
+    step, refused = _spread(problem.unknowns) * (z - one.z), None
+    for share in POLICY.left_out_shares:
+        target = white(k, block.residual - block.jacobian @ (share * step))
+        nuisance = one.nuisance[k] + nuisance_step(white(k, block.nuisance), one.nuisance[k], target)
+        try:
+            return _alone(problem, k, one.z + share * (z - one.z), nuisance)
+        except InputError as error:
+            refused = refused or error
+    assert refused is not None
+    raise refused
+
+
+def _alone(problem: CalibrationProblem, k: int, z: Array, nuisance: Array) -> Array:
+    return problem.only([k]).residuals(x_of(problem.unknowns, z), [nuisance])[0]
 
 
 def rows_as_given(fitted: Fitted) -> LeftOutRows:
@@ -425,7 +444,7 @@ def rows_as_given(fitted: Fitted) -> LeftOutRows:
     for _ in range(2):  # starts enter the temperatures linearly, through laws nearly so
         blocks = problem.linearise(x_of(problem.unknowns, z), nuisance)
         nuisance = [v + nuisance_step(b.nuisance, v, b.residual) for b, v in zip(blocks, nuisance, strict=True)]
-    return _rows_left(problem, [z] * len(nuisance), nuisance)
+    return _rows_left(problem, [_alone(problem, k, z, v) for k, v in enumerate(nuisance)])
 
 
 def degraded_channels(before: LeftOutRows, after: LeftOutRows) -> dict[str, tuple[float, float]]:
@@ -448,12 +467,11 @@ def harms(before: LeftOutRows, after: LeftOutRows) -> bool:
     return bool(rise.mean() > rise.std(ddof=min(1, len(rise) - 1)) / np.sqrt(len(rise)))
 
 
-def _rows_left(problem: CalibrationProblem, every_z: Sequence[Array], nuisance: Sequence[Array]) -> LeftOutRows:
-    """Residuals of each batch, predicted by parameters and starts of its own."""
+def _rows_left(problem: CalibrationProblem, residuals: Sequence[Array]) -> LeftOutRows:
+    """The errors of each batch in the channels' units, and their rms, from its whitened residuals."""
     errors = []
     table = []
-    for k, (z, v) in enumerate(zip(every_z, nuisance, strict=True)):
-        residual = problem.only([k]).residuals(x_of(problem.unknowns, z), [v])[0]
+    for k, residual in enumerate(residuals):
         m = problem.measured[k]
         errors.append(residual * problem.noise[m.channel])
         for c in m.usable.tolist():

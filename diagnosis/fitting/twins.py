@@ -28,6 +28,7 @@ from twin.network import Network
 from twin.quantity import Value
 from twin.schema import Body, ErrorChain, Link, MechanismPart, TwinPart
 from twin.simulation import simulate
+from twin.simulation.coupling import Trajectory
 
 
 @dataclass(frozen=True)
@@ -63,12 +64,15 @@ def drawn_misfits(
         WorkError: no more than one draw in four can be simulated.
     """  # fmt: skip
     out: list[list[Array]] = []
-    usual_W = _usual_W(problem, values)
+    usual_W, most = _usual_W(problem, values), POLICY.drawn_max_misfit * _largest_change(problem)
     for k in range(4 * draws):
         try:
-            out.append(_misfit(machine, part, batches, problem, values, usual_W, Dice(seed, k)))
+            drawn = _misfit(machine, part, batches, problem, values, usual_W, Dice(seed, k))
         except (InputError, WorkError):
             continue  # a draw that no machine has
+        if not all(np.abs(own).max() <= most for own in drawn):
+            continue
+        out.append(drawn)
         if progress:
             progress(len(out), draws)
         if len(out) == draws:
@@ -77,6 +81,12 @@ def drawn_misfits(
         f"machine {machine.machine}: {len(out)} of {4 * draws} refined twins could be simulated, expected {draws}; "
         "check the values of the machine file"
     )
+
+
+def _largest_change(problem: CalibrationProblem) -> float:
+    """The largest range of a channel within a batch, in units of the given noise."""
+    ranges = [np.ptp(m.value[m.channel == c]) / problem.noise[c] for m in problem.measured for c in m.usable.tolist()]
+    return float(max(ranges))
 
 
 def _misfit(
@@ -106,7 +116,9 @@ def _misfit(
         fine.start_degC[:, cells] += across_K * np.linspace(-1.0, 1.0, len(cells))
     laws = [h.law.name for h in network.heats if not h.disabled]
     scatter = {name: np.exp(dice.of("run", name).normal(0.0, POLICY.run_to_run_log_sd, n)) for name in laws}
-    return [f - g for f, g in zip(_shown(fine, own, scatter), _shown(problem, lumped, {}), strict=True)]
+    last = Trajectory()  # the refined twin's begins at the lumped one's, where its laws act at as many places
+    lump = _shown(problem, lumped, {}, last)
+    return [f - g for f, g in zip(_shown(fine, own, scatter, last), lump, strict=True)]
 
 
 def _usual_W(problem: CalibrationProblem, values: Array) -> dict[str, float]:
@@ -130,10 +142,10 @@ def _bent(network: Network, usual_W: Mapping[str, float], dice: Dice) -> Network
     return replace(network, heats=heats)
 
 
-def _shown(problem: CalibrationProblem, values: Array, scatter: Mapping[str, Array]) -> list[Array]:
+def _shown(problem: CalibrationProblem, values: Array, scatter: Mapping[str, Array], last: Trajectory) -> list[Array]:
     """What every batch shows, (n_b,) in units of the given noise; `scatter` (B,) multiplies heats by law."""
     inputs, start = problem.inputs_at([np.zeros(q) for q in problem.nuisance_sizes])
-    run = simulate(problem.network, values, inputs.with_own({**inputs.times, **scatter}), start)
+    run = simulate(problem.network, values, inputs.with_own({**inputs.times, **scatter}), start, last=last)
     series = np.concatenate([run.readings[0], run.errors[0]], axis=-1)
     return [m.of(s) / problem.noise[m.channel] for m, s in zip(problem.measured, series, strict=True)]
 

@@ -21,6 +21,7 @@ from twin.calibration.fit_problem import Block
 from twin.calibration.problem import CalibrationProblem, Measured, Nuisances
 from twin.network import Network, Reading
 from twin.simulation import simulate
+from twin.simulation.coupling import Trajectory
 from twin.simulation.inputs import Inputs, inputs_of_plan
 from twin.simulation.start import start_of
 
@@ -145,7 +146,7 @@ class AlternativeModel:
         """The runs begun from first readings, as a calibration begins them."""
         inputs = replace(self.problem.inputs, first={**self.problem.inputs.first, **first})
         start = start_of(self.problem.network, self.fitted.values, inputs)
-        return replace(self.problem, inputs=inputs, start_degC=start, _last={})
+        return replace(self.problem, inputs=inputs, start_degC=start, _last={}, _trajectory=Trajectory())
 
 
 def begun(fitted: Fitted, run: Run) -> dict[str, float]:

@@ -271,6 +271,20 @@ def test_two_drivers_that_changed_places_in_one_run() -> None:
     assert not CHECKS["swapped"]().across([cell_run(seed) for seed in range(6)], toy_machine())
 
 
+def test_switches_that_other_runs_used_otherwise_have_not_changed_places() -> None:
+    def run(seed: int) -> Batch:
+        rng, base = np.random.default_rng(seed), toy_batch(seed)
+        on = {"coolant": 0 if seed in (2, 5) else 1, "mist": 1 if seed in (2, 5) else 0}
+        switches = {n: np.where(rng.random(base.n_rows) < 0.6, share, 0) for n, share in on.items()}
+        speeds = np.repeat(rng.choice([0, 2000, 4000, 8000], base.n_rows // 10 + 1), 10)[: base.n_rows]
+        feeds = speeds * 0.8 if seed != 4 else np.zeros(base.n_rows)
+        series = {**switches, "speed": speeds, "feed": feeds}
+        drivers = {n: Channel(n, "driver", "1") for n in series}
+        return replace(base, table=base.table.assign(**series), channels={**base.channels, **drivers})
+
+    assert not CHECKS["swapped"]().across([run(seed) for seed in range(8)], toy_machine())
+
+
 @pytest.mark.parametrize("what", ODD)
 def test_one_run_that_is_unlike_the_others(what: str) -> None:
     odd, change, expected, words = ODD[what]

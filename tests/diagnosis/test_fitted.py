@@ -10,6 +10,8 @@ import pandas as pd
 import pytest
 
 from data.arrays import Array
+from data.errors import InputError
+from diagnosis.fitting import fitted
 from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import (
     LeftOutRows,
@@ -23,6 +25,7 @@ from tests.diagnosis.small_cases import FLOOR, cold_floor, consistent
 from twin.calibration.estimate import CalibrationOptions, LeftOut, leave_batch_out
 from twin.calibration.identifiability import intervals90
 from twin.calibration.least_squares import result
+from twin.calibration.problem import CalibrationProblem
 from twin.quantity import Value
 from twin.schema import MechanismPart, TwinPart
 
@@ -157,3 +160,22 @@ def test_the_table_is_the_rms_of_the_rows() -> None:
             assert own.loc[name, "rms"] == pytest.approx(float(np.sqrt(np.mean(error**2))))
             assert own.loc[name, "rows"] == len(error)
     assert dict(zip(done.rms["channel"], done.rms["unit"], strict=True)) == {"t_shaft": "K", "t_head": "K", "z": "um"}
+
+
+def test_values_that_would_run_away_are_met_half_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = deterministic_fit(consistent())
+    block = next(iter(one.problem.linearise(one.x, one.nuisance)))
+    asked: list[Array] = []
+
+    def alone(problem: CalibrationProblem, k: int, z: Array, nuisance: Array) -> Array:
+        asked.append(z)
+        if len(asked) < 2:
+            raise InputError("stiff beyond the step control")
+        return np.zeros(len(block.residual))
+
+    monkeypatch.setattr(fitted, "_alone", alone)
+    fitted._predicted(one, 0, block, one.z + 1.0)
+    np.testing.assert_allclose(asked, [one.z + 1.0, one.z + 0.5])
+    monkeypatch.setattr(fitted, "_alone", lambda *_: (_ for _ in ()).throw(InputError("stiff")))
+    with pytest.raises(InputError, match="stiff"):
+        fitted._predicted(one, 0, block, one.z + 1.0)

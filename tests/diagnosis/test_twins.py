@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+import pytest
+
+from diagnosis.fitting import twins
 from diagnosis.fitting.twins import Dice, refined
-from tests.diagnosis.small_cases import DRIFT, four_bodies
+from tests.diagnosis.small_cases import DRIFT, consistent, four_bodies
 from twin.compile import compile_network
 from twin.schema import twin_part
 
@@ -38,3 +42,13 @@ def test_machines_that_differ_by_an_effect_are_refined_alike_in_all_else() -> No
     assert one.mechanisms == {k: v for k, v in other.mechanisms.items() if k != "drift"}
     next_one, _ = refined(twin_part(known[0]), networks[0], networks[0].values, Dice(3, 8))
     assert next_one.links != one.links and next_one.bodies != one.bodies
+
+
+def test_a_draw_that_runs_away_is_drawn_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    at = consistent()
+    rows = [len(m.row) for m in at.problem.measured]
+    sizes = iter([1.0, 1e9, np.nan, 2.0, 3.0])
+    monkeypatch.setattr(twins, "_misfit", lambda *_: [np.full(n, size) for size in [next(sizes)] for n in rows])
+    drawn = twins.drawn_misfits(at.machine, at.part, at.batches, at.problem, at.values, draws=3, seed=0)
+    assert [own.shape for own in drawn] == [(n, 3) for n in rows]
+    assert all((own == [1.0, 2.0, 3.0]).all() for own in drawn)

@@ -132,7 +132,7 @@ def test_derivatives_of_a_linear_network_hardly_need_substeps() -> None:
     assert gap.max() < 3e-5
 
 
-def test_derivatives_through_windows_and_a_thermostat() -> None:
+def test_derivatives_of_strong_feedback_and_of_a_thermostat() -> None:
     mechanisms = {
         "load": {"law": "bearing_load", "drivers": "rpm", "into": "shaft",
                  "parameters": {"count": 4, "preload": "1500 N"}},
@@ -141,7 +141,6 @@ def test_derivatives_through_windows_and_a_thermostat() -> None:
     }  # fmt: skip
     net = network(mechanisms=mechanisms)
     inputs = drive(np.arange(0, 14401.0, 60.0), rpm=6000.0)
-    assert simulate(net, net.values, inputs, at(20, net), tolerance_K=1e-8).windows > 1
     numbers = [net.index(n) for n in ("mechanisms.load.preload", "mechanisms.tighter.kappa", "bodies.shaft.capacity")]
     assert gaps(net, inputs, at(20, net), numbers).max() < 1e-4
     cooled = one_body("5 W/K", mechanisms={

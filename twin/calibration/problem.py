@@ -17,6 +17,7 @@ from twin.calibration.fit_problem import Block, Unknown
 from twin.network import Network
 from twin.quantity import Parameter
 from twin.simulation import choose_substeps, simulate
+from twin.simulation.coupling import Trajectory
 from twin.simulation.inputs import MAX_GAP_S, Inputs, inputs_of
 from twin.simulation.sensitivity import Selected, sensitivities
 from twin.simulation.start import start_of
@@ -191,6 +192,7 @@ class CalibrationProblem:
     start_degC: Array
     nuisances: Nuisances
     _last: dict[bytes, list[Block]] = field(default_factory=dict, repr=False, compare=False)
+    _trajectory: Trajectory = field(default_factory=Trajectory, repr=False, compare=False)
 
     @classmethod
     def of(
@@ -217,7 +219,7 @@ class CalibrationProblem:
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the last point's blocks, which are long and quickly made anew."""
-        return {**self.__dict__, "_last": {}}
+        return {**self.__dict__, "_last": {}, "_trajectory": Trajectory()}
 
     @cached_property
     def unknowns(self) -> tuple[Unknown, ...]:
@@ -247,8 +249,9 @@ class CalibrationProblem:
             return self  # with what its inputs have worked out
         kept = tuple(self.measured[b] for b in batches)
         return replace(
-            self, inputs=self.inputs.batch(batches), measured=kept, start_degC=self.start_degC[batches], _last={}
-        )
+            self, inputs=self.inputs.batch(batches), measured=kept, start_degC=self.start_degC[batches], _last={},
+            _trajectory=Trajectory(),
+        )  # fmt: skip
 
     def values_at(self, x: Array) -> Array:
         """All parameter values (n,) at the free ones' fitting coordinates (p,)."""
@@ -306,7 +309,8 @@ class CalibrationProblem:
         kept = self._last.get(_key(x, nuisance))
         if kept is not None:
             return [block.residual for block in kept]
-        series = simulate(self.network, self.values_at(x), *self.inputs_at(nuisance)).shown[0]
+        run = simulate(self.network, self.values_at(x), *self.inputs_at(nuisance), last=self._trajectory)
+        series = run.shown[0]
         return [self._residual(m, s, v) for m, s, v in zip(self.measured, series, nuisance, strict=True)]
 
     @cached_property
@@ -349,7 +353,9 @@ class CalibrationProblem:
     def _blocks(self, x: Array, nuisance: Sequence[Array]) -> Iterator[Block]:
         numbers = list(dict.fromkeys([*self.network.free.tolist(), *self.nuisances.parameters.tolist()]))
         selected = Selected(numbers, len(self.nuisances.start_K) > 0, self.nuisances.surroundings.tolist())
-        simulation, *slopes = sensitivities(self.network, self.values_at(x), *self.inputs_at(nuisance), selected)
+        simulation, *slopes = sensitivities(
+            self.network, self.values_at(x), *self.inputs_at(nuisance), selected, last=self._trajectory
+        )
         series = simulation.shown[0]
         slope = np.concatenate(slopes, axis=-1)  # (Q, B, K, C)
         free = len(self.unknowns)

@@ -2,12 +2,13 @@
 
 Each iteration evaluates the laws on the previous trajectory, at both ends of every interval, and solves the linear
 network with that heat. Strong feedback is linearised: its mean slope is added to the conductance matrix (a chord). If
-the iteration still does not contract, the converged part is kept and the rest is solved in shorter windows.
+the iteration still does not contract, Newton's method follows; where that diverges, or a law needs the past, the
+converged part is kept and the rest is solved in shorter windows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from data.arrays import Array
 from data.errors import InputError, WorkError
 from twin.simulation.balance import Balance, Borders, Source
-from twin.simulation.modes import Modes, modes_of
+from twin.simulation.modes import Modes, first_order_hold, modes_of
 from twin.simulation.response import Forcing, Response
 from twin.simulation.schedule import Schedule
 
@@ -48,8 +49,54 @@ class Mixing:
         return np.asarray(new - sum(share[..., k, None] * self.was[k][0] for k in range(len(self.was))))
 
 
+class Answer:
+    """y of a linear network to heat ``w = slope (seen + y) + given`` of k sources, at outputs `matrix` (n_out, N).
+
+    The sources depend on the first n outputs, with `slope` (B, M, 2, k, n), W/K, at both ends of every interval.
+    """
+
+    def __init__(
+        self, balance: Balance, modes: Modes, directions: Array, matrix: Array, slope: Array, which: int = 0
+    ) -> None:
+        """`directions` (P, R, k, N) of the sources; `which` parameter set is answered."""
+        schedule, valid = balance.schedule, balance.inputs.valid
+        self.matrix, self.slope = matrix, slope
+        kind = np.where(valid, schedule.regime * len(schedule.step_s) + schedule.step, -1)
+        kinds, number = np.unique(kind, return_inverse=True)
+        self.number = number.reshape(kind.shape)  # of each interval's regime and step
+        regime, dt_s = kinds // len(schedule.step_s), schedule.step_s[kinds % len(schedule.step_s), None]
+        decay, start_s, end_s = first_order_hold(modes.rate_per_s[which, regime], dt_s * (kinds >= 0)[:, None])
+        shape = modes.shape[which, regime]
+        modal = (directions[which, regime] @ shape).swapaxes(-1, -2)
+        self.keeps = (shape * decay[:, None]) @ modes.inverse[which, regime]  # (kinds, N, N); behind the end all of it
+        self.of_start = shape @ (start_s[..., None] * modal)  # (kinds, N, k)
+        self.of_end = shape @ (end_s[..., None] * modal)
+        loop = slope[:, :, 1] @ (matrix[: slope.shape[-1]] @ self.of_end)[self.number]
+        self.solution = np.linalg.inv(np.eye(loop.shape[-1]) - loop)  # (B, M, k, k)
+
+    def run(self, part: slice, seen: Array, given: Array, now: Array, every: int = 1) -> tuple[Array, Array]:
+        """Outputs and, at the end, all cells of y from its cells `now` (B, N, Q) at the start of some intervals.
+
+        Time goes first: seen (m + 1, B, n, Q), given (m, 2, B, k, Q), outputs (m // every + 1, B, n_out, Q).
+        """
+        n_seen, shown = seen.shape[2], self.matrix @ now
+        out = np.empty(((part.stop - part.start) // every + 1, *shown.shape))
+        out[0] = shown
+        for i, m in enumerate(range(part.start, part.stop)):
+            number = self.number[:, m]
+            start_W = self.slope[:, m, 0] @ (seen[i] + shown[:, :n_seen]) + given[i, 0]
+            ahead = self.keeps[number] @ now + self.of_start[number] @ start_W
+            known_W = self.slope[:, m, 1] @ (seen[i + 1] + self.matrix[:n_seen] @ ahead) + given[i, 1]
+            now = ahead + self.of_end[number] @ (self.solution[:, m] @ known_W)
+            shown = self.matrix @ now
+            if (i + 1) % every == 0:
+                out[(i + 1) // every] = shown
+        return out, now
+
+
 WEAK = 0.5  # a loop gain below which the plain iteration contracts fast enough
 ROUNDS, LAST_ROUNDS = 25, 60  # of a window, and of one that is a single interval
+DIVERGES = 4.0  # times the step before: Newton's method from rest is given up
 SAMPLED = 48  # intervals per batch that a mean slope is taken over
 
 
@@ -85,15 +132,32 @@ def plain_modes(balance: Balance) -> Modes:
     return modes_of(balance.capacity_J_per_K, balance.conductance_W_per_K[:, first]).of_regimes(balance.mode_group)
 
 
-def solve(balance: Balance, sources: Sequence[Source], rows: Array, start_degC: Array, tolerance_K: float) -> Coupled:
+@dataclass
+class Trajectory:
+    """The temperatures (n + k, P, B, M + 1) that a solution ended with, from which one of near parameters begins."""
+
+    degC: Array | None = None
+
+
+def solve(
+    balance: Balance, sources: Sequence[Source], rows: Array, start_degC: Array, tolerance_K: float,
+    last: Trajectory | None = None,
+) -> Coupled:  # fmt: skip
     """The heat of temperature-dependent sources from start temperatures (P or 1, B, N); `rows` (n, N) are its places.
 
-    Stops when no place's temperature moves by more than tolerance_K / 10 from one round to the next.
+    Stops when no place's temperature moves by more than tolerance_K / 10 from one round to the next, a hundredth of it
+    from the `last` trajectory, which is replaced: the result may not depend on where the iteration begins.
 
     Raises:
         InputError: no convergence within a single interval; names the heat, the batch, the time and the remedy.
     """
-    return _Solver(balance, sources, rows, start_degC, tolerance_K / 10.0).solve()
+    solver = _Solver(balance, sources, rows, start_degC, tolerance_K / 10.0)
+    if last is not None:
+        solver.begin(last)
+    coupled = solver.solve()
+    if last is not None:
+        last.degC = solver.seen
+    return coupled
 
 
 class _Solver:
@@ -114,38 +178,55 @@ class _Solver:
         self.borders = Borders(self.seen)
         self.series = np.zeros((n_sets, len(sources), n_batches, self.n_intervals, 2))
         self.along = any(s.along for s in sources)
+        self.chord = self._chord(slice(0, self.n_intervals))
         self.rounds = 0
 
+    def begin(self, last: Trajectory) -> None:
+        """Begin at a trajectory, where it is one of this network's."""
+        if last.degC is not None and last.degC.shape == self.seen.shape:
+            self.seen[..., 1:] = np.where(np.isfinite(last.degC), last.degC, self.seen)[..., 1:]
+            self.tolerance_K /= 100.0
+
     def solve(self) -> Coupled:
-        windows, at, size = [], 0, self.n_intervals
-        chord = self._chord(slice(0, self.n_intervals))
+        whole, start_degC = slice(0, self.n_intervals), self.now_degC
+        reached = self._window(whole) if self.n_intervals else 0
+        if reached < self.n_intervals and not self.along:
+            self.now_degC = start_degC
+            reached = self.n_intervals if self._newton() else 0
+        windows = [slice(0, reached)] if reached else []
+        if reached < self.n_intervals:
+            windows += self._windows(reached)
+        return Coupled(self.series, self.borders, self.chord, windows, self.rounds)
+
+    def _windows(self, at: int) -> Iterator[slice]:
+        """The rest from a border on, as far at once as the iteration contracts."""
+        size = 2 * at or max(self.n_intervals // 8, 1)
         while at < self.n_intervals:
             part = slice(at, min(at + size, self.n_intervals))
-            reached, chord = self._window(part, chord)
+            reached = self._window(part)
             if reached == at:
                 if part.stop - at == 1:
-                    raise InputError(self._stiff(at, chord))
+                    raise InputError(self._stiff(at))
                 size = max((part.stop - at) // 8, 1)
                 continue
-            windows.append(slice(at, reached))
+            yield slice(at, reached)
             size = 2 * (part.stop - at if reached == part.stop else reached - at)
             at = reached
-        return Coupled(self.series, self.borders, chord, windows, self.rounds)
 
-    def _window(self, part: slice, chord: Chord) -> tuple[int, Chord]:
+    def _window(self, part: slice) -> int:
         """Iterate in the intervals `part`; the border up to which it converged (the start itself if nowhere)."""
         valid = np.arange(part.start, part.stop + 1) <= self.balance.inputs.n_intervals[:, None]
         seen = self.seen[..., part.start : part.stop + 1]
         seen[...] = np.where(np.isfinite(seen), seen, seen[..., :1])
         alone = part.stop - part.start == 1
-        response, base = self._response(part, chord)
+        response, base = self._response(part)
         mixing = Mixing(valid, off=self.along)
         worst: list[float] = []
         for k in range(LAST_ROUNDS if alone else ROUNDS):
             self.rounds += 1
-            heat_W = self._heat_W(part, chord)
+            heat_W = self._heat_W(part)
             if not np.isfinite(np.where(valid[:, 1:, None], heat_W, 0.0)).all():
-                return part.start, chord
+                return part.start
             new = base + self._answer(response, heat_W)
             change = np.where(valid, np.abs(new - seen), 0.0).max(axis=(0, 1, 2))
             worst.append(float(change.max()))
@@ -155,53 +236,106 @@ class _Solver:
                 break
             if k in (1, 4) and part.start == 0:  # one chord for all windows
                 fresh = self._chord(part)
-                if not np.allclose(fresh.slope_W_per_K, chord.slope_W_per_K, rtol=0.2):
-                    chord, mixing = fresh, Mixing(valid, off=self.along)
-                    response, base = self._response(part, chord)
+                if not np.allclose(fresh.slope_W_per_K, self.chord.slope_W_per_K, rtol=0.2):
+                    self.chord, mixing = fresh, Mixing(valid, off=self.along)
+                    response, base = self._response(part)
         late = np.flatnonzero(change > self.tolerance_K)
         reached = part.stop if not len(late) else part.start + max(int(late[0]) - 1, 0)
         if reached > part.start:
-            self.series[:, :, :, part.start : reached] = self._heat_W(slice(part.start, reached), chord)
+            self.series[:, :, :, part.start : reached] = self._heat_W(slice(part.start, reached))
         if part.start < reached < self.n_intervals:
-            self._advance(slice(part.start, reached), chord)
-        return reached, chord
+            self._advance(slice(part.start, reached))
+        return reached
 
-    def _advance(self, part: slice, chord: Chord) -> None:
+    def _newton(self) -> bool:
+        """Newton's method on the whole trajectory; whether it converged. What changed heat does to a linear network is
+        solved exactly, interval by interval, so that feedback of any strength takes a few rounds.
+        """
+        part, n_valid = slice(0, self.n_intervals), self.balance.inputs.n_intervals[:, None]
+        valid = np.arange(self.n_intervals + 1) <= n_valid
+        response, base = self._response(part)
+        self._rest()
+        before = np.inf
+        for _ in range(ROUNDS):
+            self.rounds += 1
+            heat_W = self._heat_W(part)
+            if not np.isfinite(np.where(valid[:, 1:, None], heat_W, 0.0)).all():
+                break
+            step = np.where(valid, base + self._answer(response, heat_W) - self.seen, 0.0)
+            slope = self._slopes()
+            for p in range(len(slope)):
+                step[:, p] += self._answered(slope[p], step[:, p], p)
+            worst = float(np.abs(step).max())
+            self.seen += step
+            if worst <= self.tolerance_K:
+                self.series[...] = self._heat_W(part)
+                return True
+            if not worst < DIVERGES * before:
+                break
+            before = worst
+        self._rest()
+        return False
+
+    def _rest(self) -> None:
+        """Every place at its start temperature throughout."""
+        self.seen[..., 1:] = self.seen[..., :1]
+
+    def _slopes(self) -> Array:
+        """Of every source's heat by `seen`, W/K (P, B, M, 2, k, n + k), with what the chord takes out."""
+        n, every = len(self.rows), slice(0, self.n_intervals)
+        n_sets, n_batches = self.seen.shape[1:3]
+        slope = np.zeros((n_sets, n_batches, self.n_intervals, 2, len(self.sources), n + len(self.sources)))
+        for k, source in enumerate(self.sources):
+            for place, watts in source.slopes(self.borders, every).items():
+                slope[..., k, place] = np.moveaxis(watts, -2, -1)
+        each = np.arange(len(self.sources))
+        slope[..., each, n + each] += self.chord.slope_W_per_K[:, self.balance.regimes.of][:, :, :, None]
+        return slope
+
+    def _answered(self, slope: Array, gap_K: Array, which: int) -> Array:
+        """What the sources' answer to a gap (n + k, B, M + 1) adds to it."""
+        answer = Answer(self.balance, self.chord.modes, self.outlets, self.matrix[which], slope, which)
+        given = np.zeros((self.n_intervals, 2, gap_K.shape[1], len(self.sources), 1))
+        now = np.zeros((gap_K.shape[1], self.matrix.shape[-1], 1))
+        out, _ = answer.run(slice(0, self.n_intervals), np.moveaxis(gap_K, (2, 1, 0), (0, 1, 2))[..., None], given, now)
+        return np.moveaxis(out[..., 0], (0, 1, 2), (2, 1, 0))
+
+    def _advance(self, part: slice) -> None:
         """Carry all cells to the end of a window that has converged."""
-        response, known = self._known(part, chord)
+        response, known = self._known(part)
         heat = known + response.forcing(self.outlets, self.series[:, :, :, part])
         every = np.eye(self.balance.network.n_cells)[None]
         self.now_degC = response.outputs(heat, self.now_degC, every, every=part.stop - part.start)[:, :, -1]
 
-    def _response(self, part: slice, chord: Chord) -> tuple[Response, Array]:
+    def _response(self, part: slice) -> tuple[Response, Array]:
         """The response in a window, and what `seen` is there without the sources, (n + k, P, B, m + 1)."""
-        response, known = self._known(part, chord)
+        response, known = self._known(part)
         return response, np.moveaxis(response.outputs(known, self.now_degC, self.matrix), -1, 0)
 
     def _answer(self, response: Response, heat_W: Array) -> Array:
         rest = np.zeros((1, *self.now_degC.shape[1:]))
         return np.moveaxis(response.outputs(response.forcing(self.outlets, heat_W), rest, self.matrix), -1, 0)
 
-    def _known(self, part: slice, chord: Chord) -> tuple[Response, Forcing]:
+    def _known(self, part: slice) -> tuple[Response, Forcing]:
         balance = self.balance
         if part == slice(0, self.n_intervals):
-            response = Response(chord.modes, balance.schedule)
+            response = Response(self.chord.modes, balance.schedule)
             return response, balance.forcing(response)
         left = np.clip(balance.inputs.n_intervals - part.start, 0, part.stop - part.start)
-        response = Response(chord.modes, Schedule(balance.inputs.dt_s[:, part], balance.regimes.of[:, part], left))
+        response = Response(self.chord.modes, Schedule(balance.inputs.dt_s[:, part], balance.regimes.of[:, part], left))
         known = Forcing()
         for directions, series in balance.known:
             known = known + response.forcing(directions, series[:, :, :, part])
         return response, known
 
-    def _heat_W(self, part: slice, chord: Chord) -> Array:
+    def _heat_W(self, part: slice) -> Array:
         """The sources' heat on the present trajectory, plus what the chord takes out, (P, k, B, m, 2)."""
         out = self.series[:, :, :, part]
         for k, source in enumerate(self.sources):
             out[:, k] = np.moveaxis(source.watts(self.borders, part), -2, -1)
-        if chord.used:
+        if self.chord.used:
             own = np.moveaxis(self.seen[len(self.rows) :, ..., part.start : part.stop + 1], 0, 1)
-            slope = np.moveaxis(chord.slope_W_per_K[:, self.balance.regimes.of[:, part]], -1, 1)[..., None]
+            slope = np.moveaxis(self.chord.slope_W_per_K[:, self.balance.regimes.of[:, part]], -1, 1)[..., None]
             out += slope * np.stack([own[..., :-1], own[..., 1:]], axis=-1)
         return out
 
@@ -260,11 +394,11 @@ class _Solver:
             out = np.maximum(out, gain.max(axis=1))
         return out
 
-    def _stiff(self, at: int, chord: Chord) -> str:
+    def _stiff(self, at: int) -> str:
         """One line about the heat that moved most in the interval that does not converge."""
         inputs = self.balance.inputs
         old = self.series[:, :, :, at].copy()
-        jump = np.abs(self._heat_W(slice(at, at + 1), chord)[..., 0, :] - old).max(axis=-1)
+        jump = np.abs(self._heat_W(slice(at, at + 1))[..., 0, :] - old).max(axis=-1)
         jump = np.where(np.isfinite(jump), jump, np.inf) * inputs.valid[None, None, :, at]
         _, k, b = (int(i) for i in np.unravel_index(int(np.argmax(jump)), jump.shape))
         name = self.sources[k].name

@@ -18,7 +18,7 @@ from data.errors import InputError
 from twin.network import Network
 from twin.simulation.balance import Balance, HeatSource, Places, Source, balance_of, check_values, sources_of
 from twin.simulation.channels import Rows, shown, watch
-from twin.simulation.coupling import Coupled, plain_modes, solve
+from twin.simulation.coupling import Coupled, Trajectory, plain_modes, solve
 from twin.simulation.inputs import Inputs, at_borders
 from twin.simulation.response import Response, States
 from twin.simulation.start import checked_start, excess_K
@@ -40,11 +40,13 @@ class Solved:
 
 @np.errstate(over="ignore", invalid="ignore")  # at values that no machine has; what is not finite is refused
 def solved_balance(
-    network: Network, values: Array, inputs: Inputs, start_degC: Array, tolerance_K: float, every: int = 1
-) -> Solved:
+    network: Network, values: Array, inputs: Inputs, start_degC: Array, tolerance_K: float, every: int = 1,
+    last: Trajectory | None = None,
+) -> Solved:  # fmt: skip
     """Solve P sets, values (P, n), from start temperatures (P or 1, B, N) to which the laws of the start are added.
 
-    The states of a linear network are given at every `every`-th border, of another at all of them.
+    The states of a linear network are given at every `every`-th border, of another at all of them, by an iteration that
+    begins at the `last` trajectory and replaces it.
     """
     balance, places = balance_of(network, values, inputs), Places()
     sources, disabled = sources_of(balance, places)
@@ -58,7 +60,7 @@ def solved_balance(
         states = response.run(balance.forcing(response), start_degC, every)
         return Solved(balance, sources, places, start_degC, response, None, states, disabled)
     rows = np.array(places.rows[:n_places]).reshape(n_places, network.n_cells)
-    coupled = solve(balance, sources, rows, start_degC, tolerance_K)
+    coupled = solve(balance, sources, rows, start_degC, tolerance_K, last)
     response = Response(coupled.chord.modes, balance.schedule)
     heat = balance.forcing(response) + response.forcing(balance.directions(sources), coupled.series_W)
     return Solved(balance, sources, places, start_degC, response, coupled, response.run(heat, start_degC), disabled)
@@ -151,11 +153,13 @@ def simulate(
     start_degC: Array | str | None = None,
     tolerance_K: float = TOLERANCE_K,
     keep_cells: bool = False,
+    last: Trajectory | None = None,
 ) -> Simulation:
     """Simulate B batches at P parameter sets, values (P, n) or (n,), in one array pass.
 
     `start_degC` (P or 1, B, N), "settled" (the steady state with the surroundings) or None (`start_of`). `tolerance_K`
-    is that of the iteration; time steps, rows of the result (`every`) and offsets of the surroundings are the inputs'.
+    is that of the iteration, which begins at the `last` trajectory of near parameters and replaces it. Time steps, rows
+    of the result (`every`) and offsets of the surroundings are the inputs'.
 
     Raises:
         InputError: arrays of a wrong shape or not finite; heat that is stiff beyond the step control.
@@ -169,7 +173,7 @@ def simulate(
         own = start if len(start) == 1 else start[part]
         offset = inputs.offsets_K
         given = inputs if offset is None or len(offset) == 1 else inputs.with_own(inputs.times, offset[part])
-        solved = solved_balance(network, values[part], given, own, tolerance_K, inputs.every)
+        solved = solved_balance(network, values[part], given, own, tolerance_K, inputs.every, last)
         parts.append(_simulated(solved, tolerance_K, keep_cells))
     return parts[0] if len(parts) == 1 else _joined(parts)
 

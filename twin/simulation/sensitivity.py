@@ -22,8 +22,8 @@ from twin.network import Edge, Heat, Network
 from twin.simulation.air import effect_K, follows
 from twin.simulation.balance import Balance, Borders, HeatSource, Source
 from twin.simulation.channels import Rows, Tangents, shown
+from twin.simulation.coupling import Answer, Trajectory
 from twin.simulation.inputs import STEP, Inputs, at_borders, stepped
-from twin.simulation.modes import first_order_hold
 from twin.simulation.response import Response
 from twin.simulation.run import (
     TOLERANCE_K,
@@ -222,49 +222,6 @@ def few(pairs: Sequence[tuple[Array, Array]], n_cells: int) -> list[tuple[Array,
     return [(np.repeat(unit[None], n_regimes, axis=0), total[i]) for i, unit in enumerate(np.eye(n_cells))]
 
 
-class Answer:
-    """y of a linear network to heat ``w = slope (seen + y) + given`` of k sources, at outputs `matrix` (n_out, N).
-
-    The sources depend on the first n outputs, with `slope` (B, M, 2, k, n), W/K, at both ends of every interval.
-    """
-
-    def __init__(self, solved: Solved, matrix: Array, slope: Array) -> None:
-        balance, modes = solved.balance, solved.response.modes
-        schedule, valid = balance.schedule, balance.inputs.valid
-        self.matrix, self.slope = matrix, slope
-        kind = np.where(valid, schedule.regime * len(schedule.step_s) + schedule.step, -1)
-        kinds, number = np.unique(kind, return_inverse=True)
-        self.number = number.reshape(kind.shape)  # of each interval's regime and step
-        regime, dt_s = kinds // len(schedule.step_s), schedule.step_s[kinds % len(schedule.step_s), None]
-        decay, start_s, end_s = first_order_hold(modes.rate_per_s[0, regime], dt_s * (kinds >= 0)[:, None])
-        shape = modes.shape[0, regime]
-        modal = (balance.directions(solved.sources)[0, regime] @ shape).swapaxes(-1, -2)
-        self.keeps = (shape * decay[:, None]) @ modes.inverse[0, regime]  # (kinds, N, N); behind the end all of it
-        self.of_start = shape @ (start_s[..., None] * modal)  # (kinds, N, k)
-        self.of_end = shape @ (end_s[..., None] * modal)
-        loop = slope[:, :, 1] @ (matrix[: slope.shape[-1]] @ self.of_end)[self.number]
-        self.solution = np.linalg.inv(np.eye(loop.shape[-1]) - loop)  # (B, M, k, k)
-
-    def run(self, part: slice, seen: Array, given: Array, now: Array, every: int = 1) -> tuple[Array, Array]:
-        """Outputs and, at the end, all cells of y from its cells `now` (B, N, Q) at the start of some intervals.
-
-        Time goes first: seen (m + 1, B, n, Q), given (m, 2, B, k, Q), outputs (m // every + 1, B, n_out, Q).
-        """
-        n_seen, shown = seen.shape[2], self.matrix @ now
-        out = np.empty(((part.stop - part.start) // every + 1, *shown.shape))
-        out[0] = shown
-        for i, m in enumerate(range(part.start, part.stop)):
-            number = self.number[:, m]
-            start_W = self.slope[:, m, 0] @ (seen[i] + shown[:, :n_seen]) + given[i, 0]
-            ahead = self.keeps[number] @ now + self.of_start[number] @ start_W
-            known_W = self.slope[:, m, 1] @ (seen[i + 1] + self.matrix[:n_seen] @ ahead) + given[i, 1]
-            now = ahead + self.of_end[number] @ (self.solution[:, m] @ known_W)
-            shown = self.matrix @ now
-            if (i + 1) % every == 0:
-                out[(i + 1) // every] = shown
-        return out, now
-
-
 RELATIVE = 1e-6  # to which derivatives of heat that needs the past converge
 ROUNDS = 60
 
@@ -293,6 +250,7 @@ def sensitivities(
     start_degC: Array | str | None = None,
     selected: Selected = ALL_FREE,
     tolerance_K: float = TOLERANCE_K,
+    last: Trajectory | None = None,
 ) -> tuple[Simulation, Array, Array]:
     """A simulation at values (n,) and its derivatives by Q `selected` unknowns.
 
@@ -309,7 +267,7 @@ def sensitivities(
     start = checked_start(network, values, inputs, start_degC)
     if len(start) != 1 or (inputs.offsets_K is not None and len(inputs.offsets_K) != 1):
         raise InputError(f"machine {network.machine}: sensitivities need one set of start temperatures and offsets")
-    solved = solved_balance(network, values, inputs, start, tolerance_K)
+    solved = solved_balance(network, values, inputs, start, tolerance_K, last=last)
     numbers = network.free.tolist() if selected.parameters is None else list(selected.parameters)
     build = UnknownsOf(solved, solved.states.at(np.eye(network.n_cells)[None])[0])
     unknowns = [build.parameter(j) for j in numbers]
@@ -413,7 +371,7 @@ class _Tangents:
             self._slopes(source, slope[:, :, :, k, n_sources:], given[..., k, :])
         each = np.arange(n_sources)
         slope[..., each, each] += coupled.chord.slope_W_per_K[0, balance.regimes.of][:, :, None]
-        answer = Answer(self.solved, matrix[0], slope)
+        answer = Answer(balance, self.solved.response.modes, balance.directions(sources), matrix[0], slope)
         y = self._answered(answer, np.ascontiguousarray(alone[:n_seen].transpose(3, 2, 0, 1)), given)
         shown = alone[n_sources:] if self.every == 1 else self._linear()
         return shown + y[:, :, n_sources:].transpose(2, 3, 1, 0)

@@ -47,8 +47,8 @@ METHOD = (
     "else, and it writes its answer before any key is opened.",
     "Opening verifies every hash, then scores. A case that was answered after the opening, or twice, is void: it is "
     "counted above and not scored.",
-    "A case is visible if the true effect, fitted, reduces a left-out error by at least a tenth, beyond the structural "
-    "null. Detection, place, mechanism and amplitude are scored on visible cases.",
+    "A case is visible if the true model, fitted again without one of its effects, loses at least 30 nats of evidence "
+    "on the recordings. Detection, place, mechanism and amplitude are scored on visible cases.",
 )
 INFORMED = "truth known"
 GLOSSARY = (
