@@ -116,13 +116,19 @@ def kinds() -> str:
 
 
 def withheld() -> str:
-    """The diagnosis on real recordings whose machine file lacks what it is known to need."""
+    """The diagnosis on real recordings whose machine file lacks what it is known to need, or without an input."""
     rows, about = table("diagnosis_withheld")
-    machines, one, two = ", ".join(sorted(set(rows["kind"]))), *(all_named(by_effects(rows, n), n) for n in (1, 2))
+    machines, without = ", ".join(sorted(set(rows["kind"]))), rows["concealed"].str.startswith("unlisted")
+    known, hidden = rows[~without], rows[without]
+    one, two = (all_named(by_effects(known, n), n) for n in (1, 2))
+    r = pd.to_numeric(hidden["r_hidden"]).dropna().abs()
     return (
-        f"{len(rows)} cases of real recordings ({machines}), used in the development, whose machine file lacks what it "
-        f"is known to need, version {about['version']}: what is missing is named in {one} cases of one effect, both in "
-        f"{two} cases of two; {true_claims(rows)} claims true."
+        f"{len(rows)} cases of real recordings ({machines}), used in the development, version {about['version']}. In "
+        f"{len(known)} the machine file lacks what it is known to need: what is missing is named in {one} cases of one "
+        f"effect, both in {two} cases of two; {true_claims(known)} claims true. In {len(hidden)} an input is hidden: "
+        f"{Share(int((hidden['true'] > 0).sum()), len(hidden))} have a claim of missing heat where the input acts; the "
+        f"course of the heat that stands out most correlates with the hidden input by {r.min():.2f} to {r.max():.2f} "
+        f"(median {r.median():.2f}, {len(r)} cases)."
     )
 
 
