@@ -13,7 +13,7 @@ from plants.sample import sample_machine as truth
 from tests.twin.drives import at, closed, drive, network, one_body
 from twin.network import Network
 from twin.simulation import choose_substeps, simulate
-from twin.simulation.coupling import Trajectory
+from twin.simulation.coupling import Answer, Trajectory
 
 SIGMA = 5.670374419e-8
 
@@ -147,7 +147,15 @@ def test_a_thermostat_against_its_closed_form() -> None:
     assert gap[0.25] < 0.12
 
 
-def test_feedback_that_does_not_contract_is_solved_by_newton_s_method() -> None:
+def _singular(*_: object) -> tuple[np.ndarray, np.ndarray]:
+    raise np.linalg.LinAlgError("Singular matrix")
+
+
+def _nowhere(answer: Answer, part: slice, seen: np.ndarray, *_: object) -> tuple[np.ndarray, np.ndarray]:
+    return np.full_like(seen, np.nan), np.zeros(0)
+
+
+def test_feedback_that_does_not_contract_is_solved_by_newton_s_method(monkeypatch: pytest.MonkeyPatch) -> None:
     """Preload that tightens as the shaft leads the housing, near its own runaway."""
     net = network(
         mechanisms={
@@ -181,6 +189,12 @@ def test_feedback_that_does_not_contract_is_solved_by_newton_s_method() -> None:
         again = simulate(net, net.values, inputs, at(20, net), tolerance_K=1e-5, last=last)
         np.testing.assert_allclose(again.readings, out.readings, atol=1e-5)
     assert again.iterations <= 2
+    for without in (_singular, _nowhere):
+        with monkeypatch.context() as patch:
+            patch.setattr(Answer, "run", without)
+            out = simulate(net, net.values, inputs, at(20, net), tolerance_K=1e-5)
+        assert out.windows > 1 and f"in {out.windows} windows" in out.message
+        np.testing.assert_allclose(out.readings[0, 0], exact, atol=2e-4 * rise)
 
 
 def test_what_cannot_be_solved_is_told_in_one_line() -> None:

@@ -263,15 +263,18 @@ class _Solver:
                 break
             step = np.where(valid, base + self._answer(response, heat_W) - self.seen, 0.0)
             slope = self._slopes()
-            for p in range(len(slope)):
-                step[:, p] += self._answered(slope[p], step[:, p], p)
+            try:
+                for p in range(len(slope)):
+                    step[:, p] += self._answered(slope[p], step[:, p], p)
+            except np.linalg.LinAlgError:  # a loop gain of exactly one within an interval
+                break
             worst = float(np.abs(step).max())
+            if not worst < DIVERGES * before:
+                break
             self.seen += step
             if worst <= self.tolerance_K:
                 self.series[...] = self._heat_W(part)
                 return True
-            if not worst < DIVERGES * before:
-                break
             before = worst
         self._rest()
         return False
