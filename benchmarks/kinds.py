@@ -200,7 +200,7 @@ def _recovered(done: Diagnosis, hidden: Mapping[str, tuple[Array, Array]]) -> di
     """Where the free series of heat stands out most from its standard deviation, and its correlation with the hidden
     input over all runs, whose times (s) and values these are by run."""
     flux = done.tables["flux"].dropna(subset=["value", "sd"])
-    flux = flux[flux["kind"] == "node"]
+    flux = flux[flux["kind"] == "heat"]
     if flux.empty:
         return {}
     strength = ((flux["value"] / flux["sd"]) ** 2).groupby(flux["place"]).mean()

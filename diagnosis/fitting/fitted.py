@@ -30,7 +30,7 @@ from diagnosis.fitting.covariance import (
 from diagnosis.fitting.fit import Fitted, nuisance_step
 from diagnosis.fitting.marginal import Hyper, Marginal
 from diagnosis.fitting.signatures import imperfections, rising_films
-from diagnosis.fitting.twins import drawn_misfits
+from diagnosis.fitting.twins import drawn_misfits, runaway
 from diagnosis.policy import POLICY
 from twin.calibration.estimate import check_batches
 from twin.calibration.fit_problem import Block, Noise, Unknown, x_of, z_bounds
@@ -414,22 +414,27 @@ def _left_out(one: Fitted) -> LeftOutRows:
 
 def _predicted(one: Fitted, k: int, block: Block, z: Array) -> Array:
     """Residual (n_b,) of a batch at the values that the others give it. These follow from one linear step, which is
-    shortened where a machine of such values would run away.
+    shortened where a machine of such values runs away.
 
     Raises:
         InputError: none of these can be simulated.
     """
     problem, white = one.problem, one.marginal.covariance.white
-    step, refused = _spread(problem.unknowns) * (z - one.z), None
+    step, most = _spread(problem.unknowns) * (z - one.z), runaway(problem)
+    residual, refused = None, InputError("")
     for share in POLICY.left_out_shares:
         target = white(k, block.residual - block.jacobian @ (share * step))
         nuisance = one.nuisance[k] + nuisance_step(white(k, block.nuisance), one.nuisance[k], target)
         try:
-            return _alone(problem, k, one.z + share * (z - one.z), nuisance)
+            residual = _alone(problem, k, one.z + share * (z - one.z), nuisance)
         except InputError as error:
-            refused = refused or error
-    assert refused is not None
-    raise refused
+            refused = error
+            continue
+        if np.abs(residual).max() <= most:
+            break
+    if residual is None:
+        raise refused
+    return residual
 
 
 def _alone(problem: CalibrationProblem, k: int, z: Array, nuisance: Array) -> Array:

@@ -64,7 +64,7 @@ def drawn_misfits(
         WorkError: no more than one draw in four can be simulated.
     """  # fmt: skip
     out: list[list[Array]] = []
-    usual_W, most = _usual_W(problem, values), POLICY.drawn_max_misfit * _largest_change(problem)
+    usual_W, most = _usual_W(problem, values), runaway(problem)
     for k in range(4 * draws):
         try:
             drawn = _misfit(machine, part, batches, problem, values, usual_W, Dice(seed, k))
@@ -83,10 +83,11 @@ def drawn_misfits(
     )
 
 
-def _largest_change(problem: CalibrationProblem) -> float:
-    """The largest range of a channel within a batch, in units of the given noise."""
+def runaway(problem: CalibrationProblem) -> float:
+    """What no machine differs from the recordings by, in units of the given noise: a multiple of the largest range of a
+    channel within a batch."""
     ranges = [np.ptp(m.value[m.channel == c]) / problem.noise[c] for m in problem.measured for c in m.usable.tolist()]
-    return float(max(ranges))
+    return POLICY.drawn_max_misfit * float(max(ranges))
 
 
 def _misfit(
