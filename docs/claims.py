@@ -121,14 +121,14 @@ def withheld() -> str:
     machines, without = ", ".join(sorted(set(rows["kind"]))), rows["concealed"].str.startswith("unlisted")
     known, hidden = rows[~without], rows[without]
     one, two = (all_named(by_effects(known, n), n) for n in (1, 2))
-    r = pd.to_numeric(hidden["r_hidden"]).dropna().abs()
+    right = Share(int((hidden["true"] > 0).sum()), len(hidden))
+    r = [f"{float(v):.2f}" for v in hidden["r_hidden"] if v]
     return (
         f"{len(rows)} cases of real recordings ({machines}), used in the development, version {about['version']}. In "
         f"{len(known)} the machine file lacks what it is known to need: what is missing is named in {one} cases of one "
-        f"effect, both in {two} cases of two; {true_claims(known)} claims true. In {len(hidden)} an input is hidden: "
-        f"{Share(int((hidden['true'] > 0).sum()), len(hidden))} have a claim of missing heat where the input acts; the "
-        f"course of the heat that stands out most correlates with the hidden input by {r.min():.2f} to {r.max():.2f} "
-        f"(median {r.median():.2f}, {len(r)} cases)."
+        f"effect, both in {two} cases of two; {true_claims(known)} claims true. In {len(hidden)} a heater's level is "
+        f"hidden: heat of no list is claimed at its place in {right}, and where a course of that heat is found, it "
+        f"correlates with the hidden level by {', '.join(r)}."
     )
 
 
