@@ -405,11 +405,12 @@ def left_out_rows(fitted: Fitted) -> LeftOutRows:
 
 
 def _left_out(one: Fitted) -> LeftOutRows:
-    blocks, (low, high) = list(one.problem.linearise(one.x, one.nuisance)), z_bounds(one.problem.unknowns)
-    every_z = [np.clip(one.level.optimum(one.grams, b), low, high) for b in range(len(blocks))]
-    return _rows_left(
-        one.problem, [_predicted(one, k, b, z) for k, (b, z) in enumerate(zip(blocks, every_z, strict=True))]
-    )
+    low, high = z_bounds(one.problem.unknowns)
+    residuals = [
+        _predicted(one, k, block, np.clip(one.level.optimum(one.grams, k), low, high))
+        for k, block in enumerate(list(one.problem.linearise(one.x, one.nuisance)))
+    ]
+    return _rows_left(one.problem, residuals)
 
 
 def _predicted(one: Fitted, k: int, block: Block, z: Array) -> Array:
