@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
 from threading import Event
 
@@ -14,7 +15,7 @@ from data.errors import InputError, WorkError
 from tests.proof.toy_suite import EXAMINEE, make, sealed, specs
 from thermodrift_exam.proof.sealing import running
 from thermodrift_exam.proof.sealing.folder import ProofFolder
-from thermodrift_exam.proof.sealing.opening import LOST, UNANSWERED, Opened, unseal
+from thermodrift_exam.proof.sealing.opening import LOST, NOT_BEGUN, UNANSWERED, Opened, unseal
 from thermodrift_exam.proof.sealing.running import Examinee, RunOutcome, run
 from thermodrift_exam.proof.sealing.seal import Suite, seal
 
@@ -196,6 +197,27 @@ def test_opened_before_the_end_the_rest_is_void(tmp_path: Path, asked: Asked) ->
     assert proof.counting == ("case_0001",)
     again = unseal(folder)
     assert again.partial and again.void == proof.void and again.state.opened == proof.state.opened
+
+
+def test_no_case_begins_after_the_end_that_was_stated_before(
+    tmp_path: Path, asked: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, end = sealed(tmp_path / "proof"), datetime(2026, 1, 31, 12, tzinfo=UTC)
+    times = iter([end - timedelta(seconds=1), end])
+
+    class Clock(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> datetime:  # type: ignore[override]
+            return next(times)
+
+    monkeypatch.setattr(running, "datetime", Clock)
+    assert run(folder, EXAMINEE, until=end).answered == 1 and asked == ["case_0001"]
+    with pytest.raises(InputError, match=r"--until: got None, expected 2026-01-31T12:00\+00:00, as before the first"):
+        run(folder, EXAMINEE)
+    proof = unseal(folder)
+    assert not proof.partial and proof.state.until == "2026-01-31T12:00+00:00"
+    assert proof.void == {"case_0002": NOT_BEGUN, "case_0003": NOT_BEGUN} and proof.counting == ("case_0001",)
+    assert unseal(folder).void == proof.void
 
 
 def test_an_answer_that_was_taken_away_or_given_twice_is_void(tmp_path: Path, asked: Asked) -> None:

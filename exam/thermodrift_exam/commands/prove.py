@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from datetime import UTC, datetime
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -160,13 +161,18 @@ def run(
     restart: Annotated[
         bool, typer.Option("--restart", help="drop the answers of another source version; the ledger records it")
     ] = False,
+    until: Annotated[
+        datetime | None,
+        typer.Option(formats=["%Y-%m-%dT%H:%MZ"], help="UTC time after which no case begins; the same in every run"),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Diagnose every case in an isolated process; existing answers stay."""
     from thermodrift_exam.proof.proving import run_proof
 
     with console.progress(as_json) as (_, done):
-        outcome = run_proof(proof, processes(workers), restart, _examinee(limit, ablated), done)
+        end = None if until is None else until.replace(tzinfo=UTC)
+        outcome = run_proof(proof, processes(workers), restart, _examinee(limit, ablated), done, end)
     if as_json:
         console.print_json(asdict(outcome))
         return

@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -120,14 +121,15 @@ def examinee(limit_s: float = LIMIT_S, ablated: int | None = None) -> Examinee:
 
 
 def run_proof(
-    out: Path, workers: int, restart: bool = False, by: Examinee | None = None, done: Done | None = None
-) -> RunOutcome:
+    out: Path, workers: int, restart: bool = False, by: Examinee | None = None, done: Done | None = None,
+    until: datetime | None = None,
+) -> RunOutcome:  # fmt: skip
     """Answer every case that has no answer yet.
 
     Raises:
         InputError, WorkError: as `thermodrift_exam.proof.sealing.running.run`.
     """
-    return run(ProofFolder(out), by or examinee(), workers, restart, done)
+    return run(ProofFolder(out), by or examinee(), workers, restart, done, until)
 
 
 def open_proof(

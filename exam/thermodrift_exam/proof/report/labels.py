@@ -35,6 +35,10 @@ _METHODS = {
 GROUPS = {"diagnosis": "Diagnosis", "baseline": "Baselines, same first fit", "ablation": "Ablations, first round only"}
 
 NOT_SEALED = "A development suite: its seed is known, so these figures show the state of the work and are no evidence."
+ENDED = (
+    "No case began after {until}, an end stated before the first answer; the cases are answered in their random order, "
+    "and those not begun are void."
+)
 PARTIAL = "Opened in part: some cases have no answer yet. These figures are no evidence."
 
 METHOD = (

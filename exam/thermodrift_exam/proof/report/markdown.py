@@ -68,6 +68,7 @@ def proof_markdown(run: ProofRun | None) -> str:
     lines = [f"**{headline(run)}** {labels.origin(run.plants)}".rstrip(), ""]
     lines += [f"{labels.NOT_SEALED}\n"] if run.suite != "sealed" else []
     lines += [f"{labels.PARTIAL}\n"] if run.partial else []
+    lines += [] if run.until is None else [labels.ENDED.format(until=labels.stamp(run.until)) + "\n"]
     lines += [
         f"- Sealed root: `{run.root}`",
         f"- Sealed {labels.stamp(run.sealed)}, opened {labels.stamp(run.opened)}, thermodrift {run.version}",

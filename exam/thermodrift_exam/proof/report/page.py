@@ -297,7 +297,12 @@ def lead(goals: pd.DataFrame) -> str:
 
 
 def _warnings(run: ProofRun) -> Sequence[str]:
-    return [*([labels.NOT_SEALED] if run.suite != "sealed" else []), *([labels.PARTIAL] if run.partial else [])]
+    ended = [] if run.until is None else [labels.ENDED.format(until=labels.stamp(run.until))]
+    return [
+        *([labels.NOT_SEALED] if run.suite != "sealed" else []),
+        *([labels.PARTIAL] if run.partial else []),
+        *ended,
+    ]
 
 
 def _facts(run: ProofRun) -> list[tuple[str, str]]:

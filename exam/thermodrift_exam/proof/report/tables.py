@@ -60,6 +60,7 @@ class ProofRun:
         version: of thermodrift.
         source_digest: digest of the source that answered.
         partial: opened before every case had an answer.
+        until: UTC; no case began after this time, which was stated before the first answer.
         isolation: protection of the answering process -> cases that ran under it.
         void: case -> reason why it does not count.
         failed: case -> its error in one line; it counts as a wrong answer.
@@ -77,6 +78,7 @@ class ProofRun:
     version: str
     source_digest: str
     partial: bool = False
+    until: str | None = None
     isolation: Mapping[str, int] = field(default_factory=dict)
     void: Mapping[str, str] = field(default_factory=dict)
     failed: Mapping[str, str] = field(default_factory=dict)

@@ -244,12 +244,14 @@ class State:
     """`answered`: digest of each case's answer since the last restart; `void`: why a case does not count.
 
     `begun`: cases with a started and unfinished process. `source`: digest of the source that
-    answers, as sealed or as restarted; `ran`: whether a run has begun.
+    answers, as sealed or as restarted; `ran`: whether a run has begun. `until`: no case begins after this time (UTC),
+    stated before the first answer.
     """
 
     root: str
     source: str
     ran: bool = False
+    until: str | None = None
     answered: Mapping[str, str] = field(default_factory=dict)
     begun: frozenset[str] = frozenset()
     void: Mapping[str, str] = field(default_factory=dict)
@@ -267,7 +269,7 @@ def state_of(entries: Iterable[Entry], where: str) -> State:
     entries = list(entries)
     if not entries or entries[0].step != "sealed":
         raise InputError(f"{where}: its ledger does not begin with the seal; seal a new proof")
-    source, ran, opened = str(entries[0].details["source"]), False, None
+    source, ran, until, opened = str(entries[0].details["source"]), False, None, None
     answered: dict[str, str] = {}
     void: dict[str, str] = {}
     begun: set[str] = set()
@@ -275,6 +277,7 @@ def state_of(entries: Iterable[Entry], where: str) -> State:
     for e in entries[1:]:
         case = str(e.details.get("case", ""))
         if e.step == "run":
+            until = until if ran else e.details.get("until")
             source, ran = str(e.details["source"]), True
         elif e.step == "started":
             begun.add(case)
@@ -295,4 +298,4 @@ def state_of(entries: Iterable[Entry], where: str) -> State:
         elif e.step == "opened" and opened is None:
             opened = e.at
     root = str(entries[0].details["root"])
-    return State(root, source, ran, answered, frozenset(begun), void, restarts, interrupted, opened)
+    return State(root, source, ran, until, answered, frozenset(begun), void, restarts, interrupted, opened)

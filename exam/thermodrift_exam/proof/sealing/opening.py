@@ -22,6 +22,7 @@ from thermodrift_exam.proof.sealing.folder import (
 from thermodrift_exam.proof.sealing.running import check_case
 from thermodrift_exam.proof.sealing.seal import names_of
 
+NOT_BEGUN = "it was not begun by the end of answering that was stated beforehand"
 UNANSWERED = "it had no answer when the proof was opened"
 LOST = "an answer is there that no run recorded"
 
@@ -63,6 +64,8 @@ def unseal(folder: ProofFolder, partial: bool = False) -> Opened:
         raise InputError(f"{folder.path}: no case was answered yet; call `thermodrift prove run {folder.path}` first")
     names = list(names_of(commitment))
     missing = [n for n in names if n not in state.answered and n not in state.void]
+    late = {n: NOT_BEGUN for n in missing if state.until is not None and n not in state.begun}
+    missing = [n for n in missing if n not in late]
     if missing and not partial and state.opened is None:
         raise InputError(
             f"{folder.path}: {len(missing)} of {len(names)} cases have no answer, the first is {missing[0]}; "
@@ -73,13 +76,13 @@ def unseal(folder: ProofFolder, partial: bool = False) -> Opened:
     for name in names:
         check_case(folder, name, commitment["cases"][name]["case"])
         salts[name], answers[name] = _answer(folder, name, commitment["cases"][name]["answer"])
-    void = dict(state.void) | dict.fromkeys(missing, UNANSWERED)
+    void = dict(state.void) | late | dict.fromkeys(missing, UNANSWERED)
     for name in set(state.answered) - set(void):
         _check_answer(folder, name, state.answered[name])
-    void |= {n: LOST for n in missing if (folder.answers / n).exists()}
+    void |= {n: LOST for n in (*missing, *late) if (folder.answers / n).exists()}
     suite = _suite_seed(folder, commitment)
     if state.opened is None:
-        for name in missing:
+        for name in (*late, *missing):
             ledger.add("void", case=name, why=void[name])
     ledger.add("opened", answered=len(state.answered), void=len(void), partial=bool(missing))
     state = state_of(ledger.entries, str(folder.path))

@@ -9,10 +9,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
-from itertools import islice
+from datetime import UTC, datetime
+from itertools import islice, takewhile
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -181,15 +182,18 @@ class RunOutcome:
 
 
 def run(
-    folder: ProofFolder, by: Examinee, workers: int = 1, restart: bool = False, done: Done | None = None
-) -> RunOutcome:
+    folder: ProofFolder, by: Examinee, workers: int = 1, restart: bool = False, done: Done | None = None,
+    until: datetime | None = None,
+) -> RunOutcome:  # fmt: skip
     """Answer every case that has no answer yet; answers are kept, interrupted cases start again.
 
     Args:
         restart: drop all answers of another source and start again; the ledger records it.
+        until: no case begins after this time (with its zone); the same for every run, since a time chosen after some
+            answers chooses cases.
 
     Raises:
-        InputError: not sealed, opened already, another source than the earlier answers', a changed case.
+        InputError: not sealed, opened already, another source or another end than the earlier answers', a changed case.
         WorkError: an answering process could not be started, or the folder cannot be written.
     """
     commitment = folder.committed()
@@ -201,11 +205,14 @@ def run(
                 f"{folder.path}: was opened at {state.opened}; a case answered after that counts for nothing, "
                 "seal a new proof"
             )
+        end = None if until is None else until.astimezone(UTC).isoformat(timespec="minutes")
+        if state.ran and end != state.until:
+            raise InputError(f"--until: got {end}, expected {state.until}, as before the first answer")
         source = source_digest()
         state = _resumed(folder, ledger, state, source, restart)
         names = list(names_of(commitment))
         waiting = [n for n in names if n not in state.answered and n not in state.void]
-        ledger.add("run", source=source, cases=len(waiting), workers=workers)
+        ledger.add("run", source=source, cases=len(waiting), workers=workers, until=end)
         finished = len(names) - len(waiting)
 
         def answered(case: str, files: dict[str, bytes]) -> None:
@@ -222,11 +229,13 @@ def run(
             _check_source(folder, source)
             return files
 
-        in_parallel(waiting, answer, answered, workers)
-    return RunOutcome(len(names), len(state.answered), len(waiting), len(state.begun), len(state.void))
+        in_time = takewhile(lambda _: until is None or datetime.now(UTC) < until, waiting)
+        in_parallel(in_time, answer, answered, workers)
+    now_answered = finished - len(names) + len(waiting)
+    return RunOutcome(len(names), len(state.answered), now_answered, len(state.begun), len(state.void))
 
 
-def in_parallel(cases: list[str], answer: Answerer, answered: Answered, workers: int) -> None:
+def in_parallel(cases: Iterable[str], answer: Answerer, answered: Answered, workers: int) -> None:
     """At most `workers` cases under way; the first failure stops the others."""
     stop, waiting = Event(), iter(cases)
 
