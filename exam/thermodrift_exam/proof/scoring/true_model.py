@@ -224,7 +224,7 @@ def _judged(
         without = [refitted(full, part).log_evidence, (refitted(fit, part, fresh=True) if own else fit).log_evidence]
     except (InputError, WorkError):
         return _Judged()
-    gain = full.log_evidence - max(without)
+    gain = float(full.log_evidence - max(without))
     return _Judged(gain, gain > VISIBLE_NATS, _size(full, s, terms[which]))
 
 
