@@ -42,7 +42,7 @@ def cases_of(proof: Path) -> pd.DataFrame:
 
 def _cpu_s(proof: Path, case: str) -> float:
     run = json.loads((proof / "answers" / case / "run.json").read_text(encoding="utf-8"))
-    return float(run["processor_seconds"])
+    return float(run["processor_seconds"] or "nan")  # a refused case has none
 
 
 def methods_of(proof: Path) -> pd.DataFrame:
