@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
-from scipy.stats import binomtest
+from scipy.stats import binomtest, ttest_rel
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "results"
@@ -74,13 +74,18 @@ def decision(machine: str) -> str:
     shown = []
     for channel, own in rows.groupby("channel", sort=False):
         mean, spread = own["S_um"].mean(), own["S_um"].std(ddof=1)
-        others = f"ridge {own['ridge_S_um'].mean():.1f}, no model {own['no_model_S_um'].mean():.1f}"
+        gap = ttest_rel(own["ridge_S_um"], own["S_um"])
+        low, high = gap.confidence_interval(0.95)
+        less = (own["ridge_S_um"] - own["S_um"]).mean()
+        paired = f"ridge {own['ridge_S_um'].mean():.1f}, difference {less:.1f}, {low:.1f} to {high:.1f}"
+        others = f"{paired}; no model {own['no_model_S_um'].mean():.1f}"
         shown.append(f"{channel} {mean:.1f} ± {spread:.1f} µm ({others})")
     below = Share(int((rows["S_um"] <= rows["bound90_S_um"]).sum()), len(rows))
     effort = about["command"].rpartition(" ")[2]
     return (
         f"mean S ± std over the last {n} runs, with all that `train --effort {effort}` does repeated before every "
-        f"fourth of them on the runs so far: {'; '.join(shown)}. {below} runs stay below the 90 % bound that was "
+        f"fourth of them on the runs so far: {'; '.join(shown)}. The differences are paired by run, with 95 % "
+        f"intervals (Student's t). {below} runs stay below the 90 % bound that was "
         f"stated for them ({below.interval}).{_without(lacking)}"
     )
 
