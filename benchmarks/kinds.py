@@ -1,7 +1,7 @@
 """Does the diagnosis hold on machines of other kinds?
 
     python -m benchmarks.kinds --kinds lathe board --cases 12 --out var/kinds
-    python -m benchmarks.kinds --paired 870000 --table results/diagnosis_kinds.csv
+    python -m benchmarks.kinds --paired 870000 --table var/diagnosis_kinds.csv
     python -m benchmarks.kinds --paired 700000 --claims results/claims.csv
     python -m benchmarks.kinds --withheld ../shared/data --table results/diagnosis_withheld.csv
 

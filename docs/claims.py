@@ -164,7 +164,10 @@ def kinds_table() -> str:
     rows, _ = table("proof_kinds")
     lines = [["machine (SIMULATED)", "cases", *KIND_COLUMNS, "CPU time, median (s)"]]
     for name, own in [*rows.groupby("machine"), ("all", rows)]:
-        shares = [f"{s} ({s.interval.removeprefix('95 % interval ')})" if s.of else "" for s in _shares(own)]
+        shares = [
+            f"{s} ({s.interval.removeprefix('95 % interval ').removesuffix(' %')})" if s.of else ""
+            for s in _shares(own)
+        ]
         lines.append([str(name), str(len(own)), *shares, f"{pd.to_numeric(own['cpu_s']).median():.0f}"])
     return f"By kind of machine, with 95 % intervals in per cent:\n\n{_markdown(lines)}"
 
