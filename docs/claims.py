@@ -218,7 +218,8 @@ def demonstrations() -> str:
         lines.append(list(map(str, (r.seed, r.concealed, r.outcome, r.claimed, p, r.left_share, r.stated_limit))))
     return (
         f"{len(rows)} seeds, version {about['version']}: the effect is found in {found} that conceal one "
-        f"({found.interval}){quiet}, and {wrong} answers have a false claim. Left-out error: after by before, mean over the channels. Limit: what the "
+        f"({found.interval}){quiet}, and {wrong} answers have a false claim. "
+        f"Left-out error: after by before, mean over the channels. Limit: what the "
         f"page says it would have claimed of an effect that it did not name.\n\n{_markdown(lines)}"
     )
 
