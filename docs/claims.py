@@ -32,9 +32,14 @@ class Share:
     of: int
 
     @property
-    def interval(self) -> str:
+    def range(self) -> str:
+        """The interval in per cent."""
         found = binomtest(self.hits, self.of).proportion_ci(method="wilson")
-        return f"95 % interval {100 * found.low:.0f} to {100 * found.high:.0f} %"
+        return f"{100 * found.low:.0f} to {100 * found.high:.0f}"
+
+    @property
+    def interval(self) -> str:
+        return f"95 % interval {self.range} %"
 
     def __str__(self) -> str:
         return f"{self.hits} of {self.of}"
@@ -108,20 +113,9 @@ def count(n: int) -> str:
 def kinds() -> str:
     """The diagnosis in the sealed proof on eight kinds of machine."""
     rows, about = table("proof_kinds")
-    n = rows["machine"].nunique()
-    return f"{len(rows)} sealed simulated cases, {n} kinds of machine, version {about['version']}: {_measures(rows)}."
-
-
-def _measures(rows: pd.DataFrame) -> str:
-    """The main measures of cases of a proof, each with its interval."""
-    said = {
-        "visible single effects named": single_named(rows),
-        "claims true": claims_true(rows),
-        "false alarms where nothing was missing": false_alarms(rows),
-        "two visible effects both named": two_named(rows),
-        "visible effects of no list called so": unlisted_called(rows),
-    }
-    return ", ".join(f"{what} in {share} ({share.interval})" for what, share in said.items())
+    n, shares = rows["machine"].nunique(), {what: measure(rows) for what, measure in KIND_MEASURES.items()}
+    said = ", ".join(f"{what} in {share} ({share.interval})" for what, share in shares.items())
+    return f"{len(rows)} sealed simulated cases, {n} kinds of machine, version {about['version']}: {said}."
 
 
 def single_named(rows: pd.DataFrame) -> Share:
@@ -153,27 +147,23 @@ def unlisted_called(rows: pd.DataFrame) -> Share:
     return Share(int(own["called_unlisted"].astype(bool).sum()), len(own))
 
 
-KIND_COLUMNS: dict[str, Callable[[pd.DataFrame], Share]] = {
-    "single named": single_named, "claims true": claims_true, "false alarms": false_alarms,
-    "both named": two_named, "unlisted called so": unlisted_called,
-}  # fmt: skip
+KIND_MEASURES: dict[str, Callable[[pd.DataFrame], Share]] = {
+    "visible single effects named": single_named,
+    "claims true": claims_true,
+    "false alarms where nothing was missing": false_alarms,
+    "two visible effects both named": two_named,
+    "visible effects of no list called so": unlisted_called,
+}
 
 
 def kinds_table() -> str:
     """The measures by kind of machine, with 95 % intervals, and the time of a case."""
     rows, _ = table("proof_kinds")
-    lines = [["machine (SIMULATED)", "cases", *KIND_COLUMNS, "CPU time, median (s)"]]
+    lines = [["machine (SIMULATED)", "cases", *KIND_MEASURES, "CPU time, median (s)"]]
     for name, own in [*rows.groupby("machine"), ("all", rows)]:
-        shares = [
-            f"{s} ({s.interval.removeprefix('95 % interval ').removesuffix(' %')})" if s.of else ""
-            for s in _shares(own)
-        ]
+        shares = [f"{s} ({s.range})" if s.of else "" for s in (measure(own) for measure in KIND_MEASURES.values())]
         lines.append([str(name), str(len(own)), *shares, f"{pd.to_numeric(own['cpu_s']).median():.0f}"])
     return f"By kind of machine, with 95 % intervals in per cent:\n\n{_markdown(lines)}"
-
-
-def _shares(rows: pd.DataFrame) -> list[Share]:
-    return [measure(rows) for measure in KIND_COLUMNS.values()]
 
 
 def kinds_compared() -> str:

@@ -66,9 +66,7 @@ def proof_markdown(run: ProofRun | None) -> str:
         return NO_RUN + "\n"
     goals = run.table("goals")
     lines = [f"**{headline(run)}** {labels.origin(run.plants)}".rstrip(), ""]
-    lines += [f"{labels.NOT_SEALED}\n"] if run.suite != "sealed" else []
-    lines += [f"{labels.PARTIAL}\n"] if run.partial else []
-    lines += [] if run.until is None else [labels.ENDED.format(until=labels.stamp(run.until)) + "\n"]
+    lines += [f"{remark}\n" for remark in run.remarks]
     lines += [
         f"- Sealed root: `{run.root}`",
         f"- Sealed {labels.stamp(run.sealed)}, opened {labels.stamp(run.opened)}, thermodrift {run.version}",

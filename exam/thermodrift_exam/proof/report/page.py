@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -234,7 +234,7 @@ def proof_page(run: ProofRun) -> Page:
         f"The diagnosis examined: {count(run.cases, 'sealed case' if sealed else 'development case')}",
         given(
             Text(lead(goals), "lead"),
-            *(Text(said, "warning") for said in _warnings(run)),
+            *(Text(said, "warning") for said in run.remarks),
             Pairs(tuple(_facts(run))),
             Text(f"Sealed root: {run.root}", "note digest"),
             Text(f"Source that answered: {run.source_digest}", "note digest"),
@@ -294,15 +294,6 @@ def lead(goals: pd.DataFrame) -> str:
     if unknown:
         parts.append(f"Without a case: {count(unknown, 'goal')}.")
     return " ".join(parts)
-
-
-def _warnings(run: ProofRun) -> Sequence[str]:
-    ended = [] if run.until is None else [labels.ENDED.format(until=labels.stamp(run.until))]
-    return [
-        *([labels.NOT_SEALED] if run.suite != "sealed" else []),
-        *([labels.PARTIAL] if run.partial else []),
-        *ended,
-    ]
 
 
 def _facts(run: ProofRun) -> list[tuple[str, str]]:

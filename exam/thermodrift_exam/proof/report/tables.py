@@ -14,13 +14,17 @@ from data.errors import WorkError
 from reports.labels import NOTHING, number, p_label, percent
 from reports.layout import Column, Gauge, Row, Table
 from thermodrift_exam.proof.report.labels import (
+    ENDED,
     KIND_WORDS,
+    NOT_SEALED,
+    PARTIAL,
     key_label,
     measured,
     plant_label,
     plant_letter,
     plant_origin,
     simulated,
+    stamp,
 )
 from thermodrift_exam.proof.spec import PLANT_KINDS, UNSEEN
 
@@ -83,6 +87,15 @@ class ProofRun:
     void: Mapping[str, str] = field(default_factory=dict)
     failed: Mapping[str, str] = field(default_factory=dict)
     tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What to know before the figures: how the suite was drawn, and where answering or opening ended early."""
+        return (
+            *([NOT_SEALED] if self.suite != "sealed" else []),
+            *([PARTIAL] if self.partial else []),
+            *([] if self.until is None else [ENDED.format(until=stamp(self.until))]),
+        )
 
     def __post_init__(self) -> None:
         for name, table in self.tables.items():
