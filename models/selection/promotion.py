@@ -313,7 +313,7 @@ def decide(result: GridResult, rule: PromotionRule, cell: str = "") -> Choice:
         if test.difference_um > 0 and clear:
             share = authority(result.curves, choice)
             choice = replace(choice, standing="provisional", authority=share)
-            summary += f"; provisional, {share:.2g} of the correction: {choice.caution}"
+            summary += f"; provisional, {100 * share:.3g} % of the correction: {choice.caution}"
         else:
             choice = replace(choice, standing="refused")
             summary += f"; {choice.caution}: no trustworthy model"

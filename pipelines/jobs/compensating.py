@@ -70,7 +70,7 @@ def check_standing(models: Mapping[str, StoredModel], provisional: bool) -> None
             S_um, bound_um = (float(m.info.get(f"expected_S_{k}um", math.nan)) for k in ("", "bound90_"))
             raise InputError(
                 f"model {name} is provisional: better than no model in most forward runs, not shown beyond doubt; it "
-                f"would act with {m.authority:g} of its correction, expected S {S_um:.2g} µm, 90 % below "
+                f"would act with {100 * m.authority:.3g} % of its correction, expected S {S_um:.2g} µm, 90 % below "
                 f"{bound_um:.2g} µm; add --provisional to accept that, or train on more runs"
             )
         if m.standing == "refused" and not is_champion(name):

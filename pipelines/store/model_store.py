@@ -88,7 +88,7 @@ class StoredModel:
     def remark(self) -> str:
         """What every record and file of it states; empty for a champion."""
         if self.standing == "provisional":
-            return f"provisional model: {self.authority:g} of the correction"
+            return f"provisional model: {100 * self.authority:.3g} % of the correction"
         return "" if self.standing == "champion" else "refused model: not shown to be better than none"
 
     def channels(self) -> tuple[str, ...]:

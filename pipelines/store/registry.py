@@ -235,11 +235,11 @@ def _register(
     if begun is not None and settled:  # compare with what it was compared with
         number = begun.tags.get("against", begun.tags.get("replaces", ""))
         champion = client.get_model_version(name, number) if number else None
-    comparison, obstacle, why = None, "", "first model of this machine and channel"
+    comparison, obstacle, why = None, "", "first champion of this machine and channel"
     if champion is not None:
         comparison, obstacle, why = _against(champion, new.result, choice, settings, new.batches)
     if choice.standing == PROVISIONAL:
-        why = f"better than no model, not shown beyond doubt; it sends {choice.authority:g} of its correction"
+        why = f"better than no model, not shown beyond doubt; it sends {100 * choice.authority:.3g} % of its correction"
     elif not choice.trusted:
         why = "no trustworthy model"
     budget_um, faults = settings.promotion.fault_budget_um, new.faults

@@ -89,7 +89,7 @@ def test_status_names_what_runs_where(year: Path, call: Call, monkeypatch: pytes
     assert done.code == 0
     assert f"  {NAME}: 6 batches, files in quarantine: 0" in done.out
     model = next(line for line in lines(done.out) if line.startswith(f"  {NAME}-z/2 champion: expected error by leave"))
-    assert "none|ridge|3 over 6 batches, simulated; first model of this machine and channel" in model
+    assert "none|ridge|3 over 6 batches, simulated; first champion of this machine and channel" in model
     done = call("status", "--json")
     got = json.loads(done.out)
     assert (done.code, done.err) == (0, "")

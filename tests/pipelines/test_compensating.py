@@ -307,7 +307,7 @@ def provisional(year: Path) -> Path:
     return year / "provisional"
 
 
-REMARK = "provisional model: 0.6 of the correction"
+REMARK = "provisional model: 60 % of the correction"
 
 
 def test_a_provisional_model_needs_the_switch_and_every_record_says_what_it_is(
@@ -324,7 +324,7 @@ def test_a_provisional_model_needs_the_switch_and_every_record_says_what_it_is(
             assert isinstance(done.exception, InputError) and not done.stdout
             assert str(done.exception) == (
                 f"model {provisional} is provisional: better than no model in most forward runs, not shown beyond "
-                "doubt; it would act with 0.6 of its correction, expected S 3.2 µm, 90 % below 5.4 µm; add "
+                "doubt; it would act with 60 % of its correction, expected S 3.2 µm, 90 % below 5.4 µm; add "
                 "--provisional to accept that, or train on more runs"
             )
             continue

@@ -45,7 +45,7 @@ def story(store):
 
 def test_the_first_becomes_champion(story):
     assert (story[0].outcome, story[0].version, story[0].name) == ("champion", 1, "toy-story-z")
-    assert "first model of this machine and channel" in story[0].summary
+    assert "first champion of this machine and channel" in story[0].summary
 
 
 def test_a_better_one_replaces_it_and_the_old_one_is_tagged(story, store):
@@ -267,7 +267,7 @@ def test_a_provisional_version_stands_in_until_there_is_a_champion(store):
     first = train(store, "toy-maybe", [5.0] * 6, **PROVISIONAL)  # the same data, judged by another rule
     assert (first.outcome, first.version, first.champion_version) == ("provisional", 2, None)
     assert (
-        "version 2 is provisional: better than no model, not shown beyond doubt; it sends 0.6 of its correction"
+        "version 2 is provisional: better than no model, not shown beyond doubt; it sends 60 % of its correction"
         in first.summary
     )
     assert train(store, "toy-maybe", [5.0] * 6, **PROVISIONAL).outcome == "unchanged"

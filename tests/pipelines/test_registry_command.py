@@ -132,7 +132,7 @@ def test_every_change_is_an_entry(story: Story, store: Any, monkeypatch: pytest.
         ("promote", 3, 4, True),
     ]  # fmt: skip
     assert all(log.carried_out)
-    assert log.entries[0].why == "first model of this machine and channel"
+    assert log.entries[0].why == "first champion of this machine and channel"
     assert log.entries[1].why.startswith("against version 1: ")
     assert log.entries[2].why == "the spindle was repaired"
     assert log.entries[4].why.startswith("by force; against version 3: ")

@@ -110,7 +110,7 @@ def test_first_model_then_nothing_new_then_a_better_one(story: Story) -> None:
     assert (again.outcome, again.version) == ("unchanged", 1)
     assert "nothing new registered" in again.summary
     assert (better.outcome, better.version, better.trusted) == ("champion", 2, True)
-    assert "first model of this machine and channel" in better.summary
+    assert "first champion of this machine and channel" in better.summary
     assert story.champion["zero again"] is None and story.champion["better"] == 2
 
 
