@@ -5,7 +5,8 @@
 Runs `thermodrift demonstrate` for the seeds from 1, two side by side, and stores a row for each: what was concealed,
 the outcome, the first claim with its probability, the left-out error after by before (mean over the channels), and,
 where the effect was not named, the least of its kind that the page says would have been claimed at its place.
-Seeds that are done are not done again. Everything is simulated.
+Seeds that are done are not done again; one whose diagnosis does not end is a row without an answer. Everything is
+simulated.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ from typing import Any
 import pandas as pd
 
 from benchmarks.results import write
+from data.errors import WorkError
 from diagnosis.findings.schema import Findings
 from reports.diagnosis.tables import by_channel, effect_label
+from thermodrift_exam.plants.concealed import conceal
 from thermodrift_exam.proof.demonstrating import Demonstration, demonstrate, key_of
 from thermodrift_exam.proof.scoring.answer_key import TrueTerm
 from thermodrift_exam.proof.scoring.matching import means
@@ -30,7 +33,15 @@ def row_of(seed: int, out: Path) -> dict[str, Any]:
     """The row of a seed, from its file where it is done already."""
     path = out / f"{seed}.json"
     if not path.exists():
-        path.write_text(json.dumps(_row(demonstrate(seed, out / str(seed))), default=float))
+        try:
+            row = _row(demonstrate(seed, out / str(seed)))
+        except WorkError as error:  # no answer is a row too
+            row = {
+                "seed": seed,
+                "concealed": conceal(seed, None).answer["words"],
+                "outcome": str(error).rpartition(": ")[2],
+            }
+        path.write_text(json.dumps(row, default=float))
     return dict(json.loads(path.read_text()))
 
 
@@ -40,7 +51,7 @@ def _row(done: Demonstration) -> dict[str, Any]:
     silent = done.judgement.outcome in ("missed", "wrong")
     return {
         "seed": done.seed, "concealed": done.answer["words"], "outcome": done.judgement.outcome,
-        "claimed": effect_label(first) if first else "", "probability": first.probability if first else "",
+        "claimed": effect_label(first) if first else "", "probability": round(first.probability, 2) if first else "",
         "left_share": round(float((rms["after"] / rms["before"]).mean()), 3),
         "stated_limit": _limit(findings, key_of(done.answer).terms[0]) if silent else "",
     }  # fmt: skip
@@ -68,7 +79,7 @@ def main() -> None:
             rows.append(row)
             print(*row.values(), sep=" | ", flush=True)
     command = f"python -m benchmarks.demonstrations --seeds {given.seeds} --table {given.table}"
-    write(given.table, pd.DataFrame(rows), command)
+    write(given.table, pd.DataFrame(rows).fillna(""), command)
 
 
 if __name__ == "__main__":
