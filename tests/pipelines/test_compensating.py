@@ -359,7 +359,7 @@ def test_a_rehearsal_runs_a_provisional_model_at_its_share(year: Path, provision
     options += ["--period-s", "60", "--rate-um-per-s", "1", "--out", str(tmp_path / "page.html")]
     done = CliRunner().invoke(app, options)
     assert done.exit_code == 0 and f"z          {REMARK}" in done.stdout
-    assert f"({REMARK})" in (tmp_path / "page.html").read_text()
+    assert f"({REMARK})" in (tmp_path / "page.html").read_text().replace("\xa0", " ")
     told = json.loads(CliRunner().invoke(app, [*options, "--json"]).stdout)
     assert told["remarks"] == {"z": REMARK}
     left = told["axes"]["z"]["band95_after_um"] / told["axes"]["z"]["band95_before_um"]

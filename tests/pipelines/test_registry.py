@@ -307,7 +307,7 @@ def test_a_name_alone_is_the_provisional_version_until_there_is_a_champion(store
         done = call(*command, "--model", "models:/toy-name-z@champion")
         assert (done.code, done.out) == (2, "")
         lacking = (
-            r"better than no model, not shown beyond doubt; it sends 0\.6 of its .*, not shown to be better than zero"
+            r"better than no model, not shown beyond doubt; it sends 60 % of its .*, not shown to be better than zero"
         )
         usable = "`predict`, `rehearse` and `export` take provisional version 1: --model models:/toy-name-z\n"
         assert re.search(f"has no champion: {lacking}; {usable}", done.err)
