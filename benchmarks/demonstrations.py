@@ -79,7 +79,7 @@ def main() -> None:
             rows.append(row)
             print(*row.values(), sep=" | ", flush=True)
     command = f"python -m benchmarks.demonstrations --seeds {given.seeds} --table {given.table}"
-    write(given.table, pd.DataFrame(rows).fillna(""), command)
+    write(given.table, pd.DataFrame(rows), command)
 
 
 if __name__ == "__main__":
