@@ -272,8 +272,8 @@ def kills() -> str:
     assert broken == 0, "state what was broken"
     return (
         f"After each of {n} kills at random moments ({each}; version {about['version']}) lake, tracking store and "
-        f"registry were whole (files that other programs read: once the command was repeated), and that command "
-        f"gave the numbers of an undisturbed one (95 %: it fails after at most {at_most(n)})."
+        f"registry were whole, and the repeated command gave the numbers of an undisturbed one (95 %: it fails after "
+        f"at most {at_most(n)})."
     )
 
 

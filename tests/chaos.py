@@ -254,7 +254,7 @@ def facts(home: Path) -> dict[str, Any]:
     lake = Lake(home / "lake")
     held = {b: [v.digest for v in vs] for m in lake.machines() for b, vs in lake.contents(m).items()}
     out: dict[str, Any] = {
-        "lake": held, "lake_trouble": lake_trouble(home), "behind": current_trouble(home),
+        "lake": held, "lake_trouble": lake_trouble(home) + current_trouble(home),
         "quarantine": sorted({(e.name, e.sha256) for e in lake.quarantined(NAME)}),
     }  # fmt: skip
     if (home / "mlflow.db").exists():
@@ -322,16 +322,12 @@ def facts_of(work: Work) -> dict[str, Any]:
     return known
 
 
-def broken_now(f: dict[str, Any], repeated: bool = True) -> Iterator[tuple[str, str]]:
-    """Invariants that hold at any time, and what is wrong.
-
-    The files that plain readers see may be behind the manifest until the command is `repeated`: a killed ingest has
-    replaced some of them (see `data.lake`).
-    """
+def broken_now(f: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Invariants that hold at any time, and what is wrong."""
     if "unreadable" in f:
         yield "unreadable", f["unreadable"][-600:]
         return
-    for text in f["lake_trouble"] + (f["behind"] if repeated else []):
+    for text in f["lake_trouble"]:
         yield "lake", text
     if f.get("running"):
         yield "running", f"runs left RUNNING: {f['running']}"
@@ -401,8 +397,7 @@ class Chaos:
         code, said = self.work.run(["status", "--json"])
         if code != 0:
             wrong.append(("status", said[-600:]))
-        known = facts_of(self.work)
-        wrong += [("after status", f"{k}: {t}") for k, t in broken_now(known, repeated=False) if k != "running"]
+        wrong += [("after status", f"{k}: {t}") for k, t in broken_now(facts_of(self.work)) if k != "running"]
         code, said = self.work.run(self.case.arguments(self.work), self.case.module)
         if code != 0 or "not retrained" in said:
             wrong.append(("again", f"exit code {code}: {said[-600:]}"))
