@@ -98,7 +98,8 @@ def steps_of(p: Posed, repeats: int, which: tuple[str, ...] = STEPS) -> Iterator
     took, seen = timed(lambda: screen(fitted, p.every), repeats)
     yield "screen", took
     if "refined twins" in which:
-        drawn = partial(drawn_misfits, fitted.machine, fitted.part, fitted.batches, problem, fitted.values)
+        middle, sd = np.zeros(len(fitted.z)), np.ones(len(fitted.z))
+        drawn = partial(drawn_misfits, fitted.machine, fitted.part, fitted.batches, problem, middle, sd)
         yield "refined twins", timed(lambda: drawn(POLICY.refined_twins, 0), 1)[0]
     yield "refit", statistics.median(timed(partial(refit, fitted, s), 1)[0] for s in chosen(fitted, seen))
     if "locate" in which:

@@ -43,9 +43,7 @@ class Policy:
     deterministic_steps: int = cost(20, "steps", "of a deterministic fit; most end after ten")
 
     # Refined twins and their covariance
-    refined_twins: int = cost(100, "draws", "directions of structure; half as many about the first calibration")
-    drawn_max_sd: float = convention(3.0, "sd of the prior", "a value farther out is none of this machine")
-    drawn_value_log_sd: float = physical(0.2, "log", "effective values of lumps scatter as much")
+    refined_twins: int = cost(100, "draws", "directions of structure")
     drawn_exponent_log_sd: float = physical(0.25, "log", "heat grows with speed by other powers than a law states")
     left_out_shares: tuple[float, ...] = convention((1.0, 0.5, 0.25, 0.125), "of a step", "each half of the one before")
     drawn_max_misfit: float = convention(10.0, "of the largest change recorded", "feedback of a draw that runs away")
@@ -68,19 +66,16 @@ class Policy:
     start_gradient_min_sd_K: float = physical(0.03, "K", "no body is at one temperature")
     run_to_run_log_sd: float = physical(0.05, "log", "no heat is the same in every run")
     draw_max_size: float = analytic(4.0, "median draws", "a larger one would be the only direction")
-    rough_memory: tuple[float, float] = convention((0.5, 0.9), "share; AR(1)", "before structure is learned")
-    rough_structure_factor: float = convention(1.5, "of the draws", "before their scale is learned")
     specific_shares: tuple[float, ...] = analytic(
         (0.0, 0.3, 1.0, 4.0), "of a draw's specific variance", "grid of the likelihood"
     )
     structure_scales: tuple[float, ...] = analytic(
-        (0.0, 0.06, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0), "of the draws", "grid of the likelihood"
+        (0.0, 0.06, 0.125, 0.25, 0.5, 1.0), "of the draws", "grid of the likelihood; what is larger is an effect"
     )
     imperfection_scales: tuple[float, ...] = analytic((0.0, 0.25, 0.5, 1.0), "of their sd", "grid of the likelihood")
-    value_scales: tuple[float, ...] = analytic((1.0, 2.0, 4.0), "of the file's spreads", "grid of the likelihood")
     start_scales: tuple[float, ...] = analytic((0.1, 0.3, 1.0), "of the file's spread", "grid of the likelihood")
     first_hyper: tuple[float, ...] = convention(
-        (0.5, 0.25, 1.0, 1.0), "of each", "where the climb to the likeliest sizes begins"
+        (0.5, 0.25, 1.0), "of each", "where the climb to the likeliest sizes begins"
     )
     hyper_rounds: int = cost(2, "rounds", "of sizes and values in turn")
     noise_min_rows: int = analytic(10, "rows", "fewer second differences show no noise")
@@ -167,7 +162,7 @@ class Policy:
     claim_min_probability: float = convention(
         0.7, "probability", "a false claim costs more than twice as much as a missed one"
     )
-    confirmed: int = cost(3, "explanations", "of a round; each takes structure drawn anew, as long as a baseline does")
+    confirmed: int = cost(3, "explanations", "of a round; structure drawn anew for each takes as long as a baseline")
     temperature_share: float = convention(0.05, "of the gain", "by as much structure scatters what explanations gain")
     temperature_min_nats: float = development(3.0, "nats", "wrong explanations lead by as much")
     max_effects: int = cost(4, "effects", "of one search")

@@ -14,11 +14,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import solve_triangular
 
 from data.arrays import Array
 from diagnosis.policy import POLICY
-from twin.calibration.fit_problem import Block
 from twin.calibration.problem import CalibrationProblem
 
 Slices = Sequence[tuple[int, slice]]  # every channel's number and rows
@@ -35,13 +34,15 @@ def slices_of(channel: NDArray[np.int64]) -> Slices:
 class Structure:
     """What covariances are learned from, in units of the given noise.
 
-    Of every batch `drawn` (n_b, T), draws of refined twins, orthogonal to the parameters, and `known` (n_b, K),
-    imperfections of any machine per sd; `noise` (C,) is each channel's white noise.
+    Of every batch `drawn` (n_b, T), draws of refined twins, and `known` (n_b, K), imperfections of any machine per sd;
+    `noise` (C,) is each channel's white noise. `stated` are the names of the unknowns whose values refined twins have
+    from their priors.
     """
 
     drawn: Sequence[Array]
     known: Sequence[Array]
     noise: Array
+    stated: frozenset[str]
 
     @cached_property
     def specific(self) -> list[Array]:
@@ -118,17 +119,6 @@ def independent(problem: CalibrationProblem, noise: Array) -> Covariance:
     return Covariance.of(problem, lambda b, c, at: noise[c] ** 2 * np.eye(at.stop - at.start))
 
 
-def rough(problem: CalibrationProblem, directions: Sequence[Array]) -> Covariance:
-    """The initial covariance: unit noise, AR(1) noise, and `directions` (n_b, K) of every batch, in given noises."""
-    share, keep = POLICY.rough_memory
-
-    def block(b: int, c: int, at: slice) -> Array:
-        rows = np.arange(at.stop - at.start)
-        return np.asarray(np.eye(len(rows)) + share * keep ** np.abs(np.subtract.outer(rows, rows)), float)
-
-    return Covariance.of(problem, block, directions=tuple(directions), drawn=directions[0].shape[1])
-
-
 def learned(problem: CalibrationProblem, structure: Structure, share: float) -> Covariance:
     """White noise and, times `share`, the variance of the draws' specific components; all directions of sd 1."""
 
@@ -163,30 +153,6 @@ def white_noise(problem: CalibrationProblem) -> Array:
         sd = max(1.0, rms) if rounded else 1.4826 * float(np.median(second))
         out[c] = np.clip(sd, *POLICY.white_noise_bounds)
     return out
-
-
-def orthogonal_to_parameters(blocks: Sequence[Block], spread: Array, drawn: Sequence[Array]) -> list[Array]:
-    """Signatures (n_b, K) less what one linear step of the parameters and nuisances, within their priors, explains.
-
-    Args:
-        blocks: of every batch, the problem linearised at a point.
-        spread: prior sd (p,) of the parameters.
-        drawn: signatures (n_b, K) of every batch, in units of the given noise.
-    """
-    size = len(spread)
-    information, shared, own = np.eye(size), np.zeros((size, drawn[0].shape[1])), []
-    for b, d in zip(blocks, drawn, strict=True):
-        jacobian, n = b.jacobian * spread, b.nuisance
-        factor = cho_factor(n.T @ n + np.eye(n.shape[1]))
-        of_jacobian, of_drawn = cho_solve(factor, n.T @ jacobian), cho_solve(factor, n.T @ d)
-        information += jacobian.T @ (jacobian - n @ of_jacobian)
-        shared += jacobian.T @ (d - n @ of_drawn)
-        own.append((jacobian, of_jacobian, of_drawn))
-    z = np.linalg.solve(information, shared)
-    return [
-        d - jacobian @ z - b.nuisance @ (of_drawn - of_jacobian @ z)
-        for b, d, (jacobian, of_jacobian, of_drawn) in zip(blocks, drawn, own, strict=True)
-    ]
 
 
 def clipped(drawn: Sequence[Array]) -> list[Array]:

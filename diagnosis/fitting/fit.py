@@ -69,7 +69,7 @@ class Fitted(Point):
         """The fit as a calibration has it; its information is that with structure integrated out."""
         state = State.at(self.problem, self.z, self.fitted_nuisance, self.noise)
         c = self.level.reduced(self.grams)[:-1, :-1]
-        root = np.asarray(np.linalg.cholesky(c + self.level.prior * np.eye(len(c))).T, float)
+        root = np.asarray(np.linalg.cholesky(c + np.eye(len(c))).T, float)
         return replace(state, arrow=replace(state.arrow, root=root, target=np.zeros(len(c))))
 
 

@@ -10,23 +10,14 @@ from functools import lru_cache
 import numpy as np
 import pandas as pd
 
-from data.arrays import Array
+from data.arrays import Array, Mask
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
 from diagnosis.contracts import Point
 from diagnosis.fitting.batches import coarse, spacing_s
 from diagnosis.fitting.carried import carried_nuisances, carried_start, carried_z, on_network
-from diagnosis.fitting.covariance import (
-    Covariance,
-    Structure,
-    clipped,
-    independent,
-    learned,
-    orthogonal_to_parameters,
-    rough,
-    white_noise,
-)
+from diagnosis.fitting.covariance import Covariance, Structure, clipped, independent, learned, white_noise
 from diagnosis.fitting.fit import Fitted, nuisance_step
 from diagnosis.fitting.marginal import Hyper, Marginal
 from diagnosis.fitting.signatures import imperfections, rising_films
@@ -58,10 +49,10 @@ def baseline(
     seed: int = 0,
     lead_rows: float | None = None,
 ) -> Fitted:
-    """The twin part fitted to all batches, under the covariance of what refined twins about that fit show.
+    """The twin part fitted to all batches, under the covariance of what refined twins show.
 
     All fits are to `coarse` rows, so that their cost does not depend on how often a machine is recorded. Refined twins
-    are drawn twice: about a first calibration, and about the fit under their covariance.
+    are drawn from the machine file's priors.
 
     Args:
         runs: the number of runs, where batches are blocks of fewer.
@@ -76,14 +67,10 @@ def baseline(
     report, runs = progress or (lambda step, n, of: None), runs or len(batches)
     report("baseline", 1, 3)
     at = _calibrated_first(machine, part, batches, lead_rows)
-    problem = at.problem
-    first = POLICY.refined_twins // 2
-    drawn = _structure(at, first, seed, report)
-    covariance = rough(problem, [POLICY.rough_structure_factor / np.sqrt(first) * d for d in drawn])
     report("baseline", 2, 3)
-    at = _fitted(_begun(at, covariance, Hyper(), runs))
+    fitted = structured(at, runs, seed=seed, report=report)
     report("baseline", 3, 3)
-    return structured(at, runs, seed, report)
+    return fitted
 
 
 def lead_of(machine: Machine, part: TwinPart, batches: Sequence[Batch]) -> float:
@@ -118,19 +105,35 @@ def _calibrated_first(
 
 
 def structured(
-    at: Point, runs: int, seed: int = 0, report: Callable[[str, int, int], None] = lambda *_: None
+    at: Point,
+    runs: int,
+    stated: frozenset[str] | None = None,
+    seed: int = 0,
+    report: Callable[[str, int, int], None] = lambda *_: None,
 ) -> Fitted:
-    """The fit under the covariance of what refined twins about it show, with all effects that it holds.
+    """The fit from a point on under the covariance of what refined twins show.
+
+    Args:
+        stated: unknowns that the machine file states, by default all: refined twins have them from their priors, and
+            the others, of effects, as they are at the point.
 
     Raises:
         WorkError: no refined twin can be simulated.
     """
-    problem = at.problem
-    drawn = _structure(at, POLICY.refined_twins, seed, report)
-    blocks = list(problem.linearise(at.x, at.nuisance))
-    known = orthogonal_to_parameters(blocks, _spread(problem.unknowns), imperfections(at))
-    structure = Structure(drawn, known, white_noise(problem))
+    names = [u.name for u in at.problem.unknowns]
+    stated = frozenset(names) if stated is None else stated
+    drawn = _drawn(at, np.array([name in stated for name in names]), seed, report)
+    structure = Structure(drawn, imperfections(at), white_noise(at.problem), stated)
     return _learned(_begun(at, *_likeliest(at, structure), runs))
+
+
+def restructured(fitted: Fitted) -> Fitted:
+    """The fit under structure that is drawn with all effects that it holds; itself where none can be drawn."""
+    structure = fitted.marginal.covariance.structure
+    if structure is not None:
+        with suppress(WorkError):
+            return replace(structured(fitted, fitted.runs, structure.stated), base=fitted.base)
+    return fitted
 
 
 def _first_calibration(channels: int) -> tuple[FitOptions, Noise]:
@@ -200,28 +203,21 @@ def _learned(begun: Fitted) -> Fitted:
     return fitted
 
 
-def _structure(at: Point, draws: int, seed: int, report: Callable[[str, int, int], None]) -> list[Array]:
-    """Misfits of refined twins (n_b, draws), orthogonal to the parameters.
+def _drawn(at: Point, stated: Mask, seed: int, report: Callable[[str, int, int], None]) -> list[Array]:
+    """Misfits of refined twins (n_b, draws); unknowns that are `stated` (p,) scatter by their priors.
 
-    A fit that lacks an effect can have values that no machine has, about which few twins can be simulated: they are
-    drawn about the nearest ones within `drawn_max_sd` then.
+    A fit that lacks an effect imitates it by values that no machine has, and refined twins of such values would be made
+    of the effect. What parameters may imitate of a misfit in one linear step is left in: priors and bounds say how far
+    they go.
     """
-
-    def progress(n: int, of: int) -> None:
-        report("refined twins", n, of)
-
-    def about(at: Point) -> list[Array]:
-        drawn = drawn_misfits(at.machine, at.part, at.batches, at.problem, at.values, draws, seed, progress)
-        films = rising_films(at)  # linear about the fit: a film in every twin takes no simulation of its own
-        sizes = np.abs(np.random.default_rng(seed).standard_normal((films[0].shape[1], draws)))
-        drawn = [d + f @ sizes for d, f in zip(drawn, films, strict=True)]
-        blocks = list(at.problem.linearise(at.x, at.nuisance))
-        return clipped(orthogonal_to_parameters(blocks, _spread(at.problem.unknowns), drawn))
-
-    try:
-        return about(at)
-    except WorkError:
-        return about(replace(at, z=np.clip(at.z, -POLICY.drawn_max_sd, POLICY.drawn_max_sd)))
+    draws = POLICY.refined_twins
+    drawn = drawn_misfits(
+        at.machine, at.part, at.batches, at.problem, np.where(stated, 0.0, at.z), stated.astype(float), draws, seed,
+        lambda n, of: report("refined twins", n, of),
+    )  # fmt: skip
+    films = rising_films(at)  # linear about the fit: a film in every twin takes no simulation of its own
+    sizes = np.abs(np.random.default_rng(seed).standard_normal((films[0].shape[1], draws)))
+    return clipped([d + f @ sizes for d, f in zip(drawn, films, strict=True)])
 
 
 def _likeliest(at: Point, structure: Structure) -> tuple[Covariance, Hyper]:
@@ -317,7 +313,7 @@ def relinearised(fitted: Fitted, steps: int = POLICY.fit_steps) -> Fitted:
             if not all(np.isfinite(r).all() for r in white):
                 return white, np.inf
             grams = marginal.grams([r[:, None] for r in white])
-            return white, float(level.reduced(grams)[0, 0] + level.prior * (z @ z))
+            return white, float(level.reduced(grams)[0, 0] + (z @ z))
 
     def at(z: Array, left: Sequence[Array]) -> Fitted:
         blocks = problem.linearise(x_of(problem.unknowns, z), fitted.nuisance)
@@ -331,7 +327,7 @@ def relinearised(fitted: Fitted, steps: int = POLICY.fit_steps) -> Fitted:
     here, damping = at(z, left), 0.0
     for _ in range(steps):
         c = level.reduced(here.grams)
-        normal = c[:-1, :-1] + level.prior * np.eye(len(z))
+        normal = c[:-1, :-1] + np.eye(len(z))
         slope = c[:-1, -1] - normal @ z
         for _ in range(POLICY.damping_tries):
             moved = np.clip(z + np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slope), low, high)

@@ -25,16 +25,14 @@ TINY = 1e-300
 
 @dataclass(frozen=True)
 class Hyper:
-    """Sizes of what is integrated out: structure of refined twins, imperfections, starts of bodies, values of the file.
+    """Sizes of what is integrated out: structure of refined twins, imperfections, starts of bodies.
 
-    Factors on what was drawn, on the policy's sd, on the machine file's `initial_spread` and on the spreads of its
-    values: those of lumps are effective ones, which a drawing does not state.
+    Factors on what was drawn, on the policy's sd and on the machine file's `initial_spread`.
     """
 
     structure: float = 1.0
     imperfections: float = 1.0
     starts: float = 1.0
-    values: float = 1.0
 
     def nuisance_sds(self, count: int, starts: int) -> Array:
         """Prior sd (count,) of a batch's nuisances, of which the first are `starts` of bodies."""
@@ -44,7 +42,7 @@ class Hyper:
         """Those one step of the grid away, one size at a time."""
         for name, grid in {
             "structure": POLICY.structure_scales, "imperfections": POLICY.imperfection_scales,
-            "starts": POLICY.start_scales, "values": POLICY.value_scales,
+            "starts": POLICY.start_scales,
         }.items():  # fmt: skip
             k = grid.index(getattr(self, name))
             yield from (replace(self, **{name: grid[j]}) for j in (k - 1, k + 1) if 0 <= j < len(grid))
@@ -156,7 +154,6 @@ class Level:
         self.of, covariance = of, of.covariance
         size = np.ones(covariance.count)
         size[: covariance.drawn], size[covariance.drawn :] = hyper.structure, hyper.imperfections
-        self.prior = 1.0 / hyper.values**2  # precision of the model's parameters z
         self.size = size
         self.nuisance_sd = [hyper.nuisance_sds(len(n), of.starts) for n in of.nuisance_gram]
         try:
@@ -213,14 +210,14 @@ class Level:
 
     def log_evidence(self, grams: Grams, z: Array | None = None) -> float:
         """Log marginal likelihood, up to a constant, of columns [model (p), target]: parameters of prior
-        N(0, `values`²) integrated out. The peak is taken where the columns promise it, or at z (p,), where it was
+        N(0, 1) integrated out. The peak is taken where the columns promise it, or at z (p,), where it was
         simulated: derivatives of another point promise too much."""
         return self._log_evidence(self.products(grams), z=z)
 
     def _log_evidence(self, products: tuple[Array, Array], without: int | None = None, z: Array | None = None) -> float:
         try:
             c = self._reduced(*products, without)
-            root = np.linalg.cholesky(c[:-1, :-1] + self.prior * np.eye(len(c) - 1))
+            root = np.linalg.cholesky(c[:-1, :-1] + np.eye(len(c) - 1))
         except np.linalg.LinAlgError:  # columns of values that no machine has
             return -np.inf
         if z is None:
@@ -228,10 +225,10 @@ class Level:
             left = float(c[-1, -1] - fitted @ fitted)
         else:
             aim = np.append(-z, 1.0)
-            left = float(aim @ c @ aim + self.prior * (z @ z))
+            left = float(aim @ c @ aim + z @ z)
         factor = self.factor if without is None else self.folds[without]
         logs = 2.0 * float(np.log(np.diag(root)).sum() + np.log(np.diag(factor[0])).sum())
-        logs += float(self._volume.sum()) - (len(c) - 1) * np.log(self.prior)
+        logs += float(self._volume.sum())
         if without is not None:
             logs -= float(self._volume[without])
         return -0.5 * (left + logs)
@@ -255,14 +252,14 @@ class Level:
         mixed -= cross.T @ by_directions[:, : along.shape[1]]
         squares -= np.einsum("kc,kc->c", along, by_directions[:, : along.shape[1]])
         c = inner - cross.T @ by_directions[:, along.shape[1] :]
-        shadow = np.linalg.solve(c[:-1, :-1] + self.prior * np.eye(len(c) - 1), mixed[:-1])
+        shadow = np.linalg.solve(c[:-1, :-1] + np.eye(len(c) - 1), mixed[:-1])
         left = np.maximum(squares - np.einsum("pc,pc->c", mixed[:-1], shadow), TINY)
         return Scores(left, mixed[-1] - shadow.T @ c[:-1, -1], shadow)
 
     def optimum(self, grams: Grams, without: int | None = None) -> Array:
         """z (p,) of columns [model (p), target]."""
         c = self.reduced(grams, without)
-        return np.asarray(np.linalg.solve(c[:-1, :-1] + self.prior * np.eye(len(c) - 1), c[:-1, -1]), float)
+        return np.asarray(np.linalg.solve(c[:-1, :-1] + np.eye(len(c) - 1), c[:-1, -1]), float)
 
     def leftover(self, columns: Sequence[Array], z: Array, grams: Grams) -> list[Array]:
         """Whitened rows (n_b,) left of the target in columns [model (p), target] at z and at the likeliest directions

@@ -269,17 +269,17 @@ def _read_otherwise(fitted: Point, c: Candidate, run: Simulation) -> list[Array]
 
 
 def _exchanged(fitted: Point, c: Candidate, before: Sequence[Array]) -> list[Array] | None:
-    """Two labels exchanged move no heat: the simulation is read the other way round; None if that fits worse."""
+    """Two labels exchanged move no heat: the simulation is read the other way round; None if no run has rows of both at
+    the same times."""
     assert c.part is not None and c.part.acts_on is not None
     one, other = (fitted.problem.channels.index(name) for name in c.part.acts_on)
     noise = fitted.problem.noise
-    out, gain = [], 0.0
+    out = []
     for m, r in zip(fitted.problem.measured, before, strict=True):
         change = r * 0.0
         a, b = m.channel == one, m.channel == other
         if a.sum() == b.sum() and (m.row[a] == m.row[b]).all():
             shown_a, shown_b = m.value[a] - r[a] * noise[one], m.value[b] - r[b] * noise[other]
             change[a], change[b] = (shown_b - shown_a) / noise[one], (shown_a - shown_b) / noise[other]
-        gain += float(r @ r - (r - change) @ (r - change))
         out.append(change)
-    return out if gain > 0 else None
+    return out if any(change.any() for change in out) else None

@@ -21,6 +21,7 @@ from data.machine import Machine
 from diagnosis.candidates.library import ends_of
 from diagnosis.fitting.carried import on_network
 from diagnosis.policy import POLICY
+from twin.calibration.fit_problem import x_of
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.mechanisms import MECHANISMS
@@ -52,22 +53,28 @@ def drawn_misfits(
     part: TwinPart,
     batches: Sequence[Batch],
     problem: CalibrationProblem,
-    values: Array,
+    centre: Array,
+    spread: Array,
     draws: int,
     seed: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Array]:
-    """What `draws` refined twins about parameter values (n,) show beyond the lumped one, (n_b, draws) of every batch in
-    units of the given noise.
+    """What `draws` refined twins show beyond the lumped one of the same values, (n_b, draws) of every batch in units of
+    the given noise.
+
+    Args:
+        centre, spread: mean and sd (p,) of the z that they have.
 
     Raises:
         WorkError: no more than one draw in four can be simulated.
     """  # fmt: skip
     out: list[list[Array]] = []
-    usual_W, most = _usual_W(problem, values), runaway(problem)
+    usual_W, most = _usual_W(problem, problem.values_at(x_of(problem.unknowns, centre))), runaway(problem)
     for k in range(4 * draws):
+        dice = Dice(seed, k)
+        z = centre + spread * [dice.of("value", u.name).normal() for u in problem.unknowns]
         try:
-            drawn = _misfit(machine, part, batches, problem, values, usual_W, Dice(seed, k))
+            drawn = _misfit(machine, part, batches, problem, z, usual_W, dice)
         except (InputError, WorkError):
             continue  # a draw that no machine has
         if not all(np.abs(own).max() <= most for own in drawn):
@@ -95,19 +102,15 @@ def _misfit(
     part: TwinPart,
     batches: Sequence[Batch],
     problem: CalibrationProblem,
-    values: Array,
+    z: Array,
     usual_W: Mapping[str, float],
     dice: Dice,
 ) -> list[Array]:
     """One refined twin less the lumped one with the same totals, (n_b,) of every batch."""
-    network = problem.network
-    lumped, drawn = values.copy(), values.copy()
-    for j, p in enumerate(network.parameters):
-        if p.free and p.scale == "log" and drawn[j] > 0:
-            lumped[j] = drawn[j] = drawn[j] * np.exp(dice.of("value", p.name).normal(0.0, POLICY.drawn_value_log_sd))
-    finer, cut = refined(part, network, drawn, dice)
+    network, values = problem.network, problem.values_at(x_of(problem.unknowns, z))
+    finer, cut = refined(part, network, values, dice)
     fine = on_network(problem, batches, _bent(compile_network(machine, part=finer), usual_W, dice))
-    known = {p.name: v for p, v in zip(network.parameters, drawn, strict=True)}
+    known = {p.name: v for p, v in zip(network.parameters, values, strict=True)}
     own = np.array([known.get(p.name, v) for p, v in zip(fine.network.parameters, fine.network.values, strict=True)])
     n = len(batches)
     for body in cut:  # the history of a machine causes gradients
@@ -118,7 +121,7 @@ def _misfit(
     laws = [h.law.name for h in network.heats if not h.disabled]
     scatter = {name: np.exp(dice.of("run", name).normal(0.0, POLICY.run_to_run_log_sd, n)) for name in laws}
     last = Trajectory()  # the refined twin's begins at the lumped one's, where its laws act at as many places
-    lump = _shown(problem, lumped, {}, last)
+    lump = _shown(problem, values, {}, last)
     return [f - g for f, g in zip(_shown(fine, own, scatter, last), lump, strict=True)]
 
 

@@ -159,7 +159,7 @@ def similarity(fitted: Fitted, seen: Screen, scored: Sequence[Scored]) -> Array:
     white = marginal.white([x[:, which] for x in seen.signatures.columns])
     every = [np.hstack([x[:, :-1], w]) for x, w in zip(fitted.columns, white, strict=True)]
     c = fitted.level.reduced(marginal.grams(every))
-    gram = c[p:, p:] - c[p:, :p] @ cho_solve(cho_factor(c[:p, :p] + fitted.level.prior * np.eye(p)), c[:p, p:])
+    gram = c[p:, p:] - c[p:, :p] @ cho_solve(cho_factor(c[:p, :p] + np.eye(p)), c[:p, p:])
     size = np.sqrt(np.maximum(np.diag(gram), TINY))
     return np.asarray(np.abs(gram) / np.outer(size, size))
 

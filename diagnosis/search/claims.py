@@ -28,7 +28,7 @@ class Tried:
 
     `by_run` (B,) is what each left-out batch gains, `cluster` the first of the candidates that these recordings cannot
     distinguish, `log_prior` of its law and of the equipment that it needs. Where it is `confirmed`, the gain is
-    the lesser under two structures: that of the fit before, and the one that is drawn anew about either fit.
+    the lesser under two structures: that of the fit before, and the one that is drawn with what either fit holds.
     """
 
     scored: Scored

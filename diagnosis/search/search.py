@@ -13,7 +13,7 @@ from data.processes import Processes
 from diagnosis.candidates.free_forms import Form, candidate_of, free_forms
 from diagnosis.contracts import Candidate, with_parts
 from diagnosis.fitting.fit import Fitted
-from diagnosis.fitting.fitted import refitted, relearned, structured
+from diagnosis.fitting.fitted import refitted, relearned, restructured
 from diagnosis.localisation.balance import impossible
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, proposed, screen
@@ -110,7 +110,7 @@ def decided(done: Round) -> Round:
     """A round with the gains of its explanations: first those that make possible what the recordings show, then the
     likeliest.
 
-    Structure that is drawn about a fit without an effect may imitate one, or be made of what an effect would explain.
+    Structure that is drawn without an effect lacks what the effect makes of gradients, and with it may imitate more.
     So the likeliest is confirmed, and the next one if it loses its place by that; after a few, the best of them stays.
     """
     if not done.tried:
@@ -124,21 +124,14 @@ def decided(done: Round) -> Round:
         resolved = _resolves(first, strange)
         if not left or first.confirmed or resolved or found.probability < POLICY.claim_min_probability:
             break
-        anew = anew or _redrawn(before)
+        anew = anew or restructured(before)
         tried[0] = _confirmed(first, anew)
     return replace(done, before=before, tried=tuple(tried), figures=found, resolved=resolved)
 
 
-def _redrawn(fitted: Fitted) -> Fitted:
-    """The fit under structure that is drawn anew about it; itself where none can be drawn."""
-    with suppress(WorkError):
-        return structured(fitted, fitted.runs)
-    return fitted
-
-
 def _confirmed(t: Tried, before: Fitted) -> Tried:
-    """An explanation with what it gains at least: also under structure that is drawn anew about both fits."""
-    again = _redrawn(t.fitted).log_evidence - before.log_evidence
+    """An explanation with what it gains at least: also where both fits are under structure of their own."""
+    again = restructured(t.fitted).log_evidence - before.log_evidence
     return replace(t, gain=min(t.gain, again), confirmed=True)
 
 

@@ -12,6 +12,7 @@ import pytest
 from data.errors import InputError, WorkError
 from data.processes import Processes
 from diagnosis.candidates.discretisation import never_reported, slack
+from diagnosis.fitting import fitted as fitted_module
 from diagnosis.fitting.fit import Fitted
 from diagnosis.fitting.fitted import degraded_channels, deterministic_fit, left_out_rows
 from diagnosis.policy import POLICY
@@ -129,7 +130,7 @@ def test_a_baseline_stays_where_without_the_effect_no_machine_is(monkeypatch: py
 def test_what_a_refit_would_keep_without_its_effect_is_no_gain() -> None:
     """A fit before that has stopped short of its likeliest sizes and noise."""
     r = found("drift").rounds[0]
-    short = replace(r.before, hyper=replace(r.before.hyper, structure=8.0, starts=1.0))
+    short = replace(r.before, hyper=replace(r.before.hyper, structure=0.0))
     assert short.log_evidence < r.before.log_evidence - 10
     again = decided(replace(r, before=short))
     assert again.before.log_evidence > r.before.log_evidence - 1 and again.best is not None and r.best is not None
@@ -143,10 +144,10 @@ def test_an_explanation_that_structure_drawn_anew_does_not_bear_out_is_not_claim
     r = found("drift").rounds[0]
     assert r.best is not None and r.best.confirmed and r.accepted
 
-    def anew(fitted: Fitted, runs: int) -> Fitted:
+    def anew(fitted: Fitted) -> Fitted:
         return r.before if fitted is r.best.fitted else fitted  # type: ignore[union-attr]
 
-    monkeypatch.setattr(search_module, "structured", anew)
+    monkeypatch.setattr(search_module, "restructured", anew)
     again = decided(r)
     assert again.best is not None and again.best.candidate != r.best.candidate
     lost = next(t for t in again.tried if t.candidate == r.best.candidate)
@@ -170,7 +171,7 @@ def test_a_further_effect_is_looked_for_after_a_claim_only(monkeypatch: pytest.M
 def test_what_was_not_confirmed_is_not_claimed(monkeypatch: pytest.MonkeyPatch) -> None:
     """After the last confirmation the best confirmed one stays, whatever others promise."""
     r = found("drift").rounds[0]
-    monkeypatch.setattr(search_module, "structured", lambda fitted, runs: r.before)
+    monkeypatch.setattr(search_module, "restructured", lambda fitted: r.before)
     monkeypatch.setattr(search_module, "POLICY", replace(POLICY, confirmed=1))
     again = decided(r)
     assert again.best is not None and again.best.confirmed and not again.accepted
@@ -179,11 +180,11 @@ def test_what_was_not_confirmed_is_not_claimed(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.integration
 def test_where_no_twin_can_be_drawn_anew_a_claim_is_judged_by_its_own_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    def none(*_: Any) -> None:
+    def none(*_: Any, **__: Any) -> None:
         raise WorkError("no refined twin could be simulated")
 
     r = found("drift").rounds[0]
-    monkeypatch.setattr(search_module, "structured", none)
+    monkeypatch.setattr(fitted_module, "structured", none)
     again = decided(r)
     assert again.accepted and again.best is not None and r.best is not None
     assert again.best.candidate == r.best.candidate and again.best.gain >= r.best.gain - 1e-6

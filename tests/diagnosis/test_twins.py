@@ -49,6 +49,7 @@ def test_a_draw_that_runs_away_is_drawn_anew(monkeypatch: pytest.MonkeyPatch) ->
     rows = [len(m.row) for m in at.problem.measured]
     sizes = iter([1.0, 1e9, np.nan, 2.0, 3.0])
     monkeypatch.setattr(twins, "_misfit", lambda *_: [np.full(n, size) for size in [next(sizes)] for n in rows])
-    drawn = twins.drawn_misfits(at.machine, at.part, at.batches, at.problem, at.values, draws=3, seed=0)
+    z = np.zeros_like(at.z)
+    drawn = twins.drawn_misfits(at.machine, at.part, at.batches, at.problem, z, z + 1.0, draws=3, seed=0)
     assert [own.shape for own in drawn] == [(n, 3) for n in rows]
     assert all((own == [1.0, 2.0, 3.0]).all() for own in drawn)
