@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from data.arrays import Array
 from diagnosis.fitting.fit import Fitted
 from diagnosis.policy import POLICY
+from twin.calibration.fit_problem import x_of
 from twin.simulation import Simulation, simulate
 
 
@@ -27,8 +28,8 @@ class Impossible:
     """A sensor that left what its part can reach without heat.
 
     `bodies` are all that conduction connects with it, `to_s` the time in the batch until which no heat entered them,
-    `excess_K` how far the channel was at most beyond what they can reach (negative: below), `watts` the
-    mean heat that this takes.
+    `excess_K` how far the channel was at most beyond what they can reach (negative: below), `watts` the mean heat that
+    this takes by the machine file's own values: fitted ones imitate the heat that is missing.
     """
 
     channel: str
@@ -54,17 +55,17 @@ def impossible(fitted: Fitted) -> tuple[Impossible, ...]:
     """Of every channel the clearest instance, the largest excess first."""
     problem = fitted.problem
     network, values = problem.network, fitted.values
+    stated = problem.values_at(x_of(problem.unknowns, np.zeros(len(problem.unknowns))))
     first = [np.zeros(q) for q in problem.nuisance_sizes]  # as the first readings: a start may hide what cannot be
     run = simulate(network, values, *problem.inputs_at(first), keep_cells=True)
     seen = np.sum([r.cells for r in network.readings], axis=0) if network.readings else np.zeros(network.n_cells)
     unknown_K = np.where(seen > 0, 0.0, POLICY.unseen_start_sd * network.start_spread_K)
     found: dict[str, Impossible] = {}
     for cells in _parts(network.conductance_W_per_K(values)):
-        reach = _Reach.of(
-            run, cells, network.surrounding_W_per_K(values), _driven(run, values, cells), unknown_K[cells]
-        )
+        exposed = network.surrounding_W_per_K(stated)
+        reach = _Reach.of(run, cells, exposed, _driven(run, values, cells), unknown_K[cells])
         bodies = tuple(name for name, own in network.bodies.items() if set(own) <= set(cells.tolist()))
-        capacity = float(network.capacity_J_per_K(values)[cells].sum())
+        capacity = float(network.capacity_J_per_K(stated)[cells].sum())
         for reading in network.readings:
             of_place = all(law.disabled or law.mechanism.along_time for law in reading.effects)  # and its past
             if of_place and np.isin(np.flatnonzero(reading.cells), cells).all():
