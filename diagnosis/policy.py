@@ -64,6 +64,7 @@ class Policy:
     leak_share: float = physical(0.15, "of a heat", "at most, into a neighbour of the body that it is drawn into")
     start_gradient_share: float = physical(0.1, "of the file's initial spread", "what a machine has done before")
     start_gradient_min_sd_K: float = physical(0.03, "K", "no body is at one temperature")
+    drawn_timing_rows: float = analytic(0.5, "rows", "a row does not say when within it a driver changed")
     run_to_run_log_sd: float = physical(0.05, "log", "no heat is the same in every run")
     draw_max_size: float = analytic(4.0, "median draws", "a larger one would be the only direction")
     specific_shares: tuple[float, ...] = analytic(

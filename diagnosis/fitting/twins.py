@@ -30,6 +30,7 @@ from twin.quantity import Value
 from twin.schema import Body, ErrorChain, Link, MechanismPart, TwinPart
 from twin.simulation import simulate
 from twin.simulation.coupling import Trajectory
+from twin.simulation.inputs import Inputs
 
 
 @dataclass(frozen=True)
@@ -121,8 +122,12 @@ def _misfit(
     laws = [h.law.name for h in network.heats if not h.disabled]
     scatter = {name: np.exp(dice.of("run", name).normal(0.0, POLICY.run_to_run_log_sd, n)) for name in laws}
     last = Trajectory()  # the refined twin's begins at the lumped one's, where its laws act at as many places
-    lump = _shown(problem, values, {}, last)
-    return [f - g for f, g in zip(_shown(fine, own, scatter, last), lump, strict=True)]
+    lump = _shown(problem, values, lambda inputs: inputs, last)
+
+    def acted(inputs: Inputs) -> Inputs:
+        return _timed(inputs, dice).with_own({**inputs.times, **scatter})
+
+    return [f - g for f, g in zip(_shown(fine, own, acted, last), lump, strict=True)]
 
 
 def _usual_W(problem: CalibrationProblem, values: Array) -> dict[str, float]:
@@ -146,10 +151,24 @@ def _bent(network: Network, usual_W: Mapping[str, float], dice: Dice) -> Network
     return replace(network, heats=heats)
 
 
-def _shown(problem: CalibrationProblem, values: Array, scatter: Mapping[str, Array], last: Trajectory) -> list[Array]:
-    """What every batch shows, (n_b,) in units of the given noise; `scatter` (B,) multiplies heats by law."""
+def _timed(inputs: Inputs, dice: Dice) -> Inputs:
+    """Inputs whose drivers change a little sooner or later: no row says when within it a driver changed."""
+    drivers = {}
+    for name, held in inputs.drivers.items():
+        step, most = np.nan_to_num(np.diff(held, axis=1)), POLICY.drawn_timing_rows
+        sooner = dice.of("time", name).uniform(-most, most, step.shape)
+        drivers[name] = moved = held.copy()
+        moved[:, :-1] += np.maximum(sooner, 0.0) * step
+        moved[:, 1:] += np.minimum(sooner, 0.0) * step
+    return replace(inputs, drivers=drivers)
+
+
+def _shown(
+    problem: CalibrationProblem, values: Array, acted: Callable[[Inputs], Inputs], last: Trajectory
+) -> list[Array]:
+    """What every batch shows, (n_b,) in units of the given noise, of what has `acted` on it."""
     inputs, start = problem.inputs_at([np.zeros(q) for q in problem.nuisance_sizes])
-    run = simulate(problem.network, values, inputs.with_own({**inputs.times, **scatter}), start, last=last)
+    run = simulate(problem.network, values, acted(inputs), start, last=last)
     series = np.concatenate([run.readings[0], run.errors[0]], axis=-1)
     return [m.of(s) / problem.noise[m.channel] for m, s in zip(problem.measured, series, strict=True)]
 
