@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -53,3 +55,17 @@ def test_a_draw_that_runs_away_is_drawn_anew(monkeypatch: pytest.MonkeyPatch) ->
     drawn = twins.drawn_misfits(at.machine, at.part, at.batches, at.problem, z, z + 1.0, draws=3, seed=0)
     assert [own.shape for own in drawn] == [(n, 3) for n in rows]
     assert all((own == [1.0, 2.0, 3.0]).all() for own in drawn)
+
+
+def test_a_driver_changes_at_most_half_a_row_sooner_or_later_in_each_twin_by_its_own() -> None:
+    at = consistent()
+    inputs, _ = at.problem.inputs_at([np.zeros(q) for q in at.problem.nuisance_sizes])
+    step = replace(inputs, drivers={"rpm": np.array([[0.0, 0.0, 6.0, 6.0]]), "feed": np.full((1, 4), 2.0)})
+    drawn = [twins._timed(step, Dice(3, k)).drivers for k in range(200)]
+    moved = np.array([d["rpm"][0] for d in drawn])
+    assert all((d["feed"] == 2.0).all() for d in drawn)
+    assert (moved[:, [0, 3]] == [0.0, 6.0]).all()
+    sooner, later = moved[:, 1] / 6.0, 1.0 - moved[:, 2] / 6.0  # in rows
+    assert ((sooner == 0.0) | (later == 0.0)).all()
+    assert 0.45 < sooner.max() <= 0.5 and 0.45 < later.max() <= 0.5
+    assert step.drivers["rpm"].tolist() == [[0.0, 0.0, 6.0, 6.0]]
