@@ -6,17 +6,20 @@ enter one at a time as long as the criterion falls, all amplitudes refitted at e
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
 from data.arrays import Array
 from diagnosis.contracts import Scored
-from diagnosis.fitting.covariance import orthogonal_to_parameters, slices_of
+from diagnosis.fitting.covariance import slices_of
 from diagnosis.policy import POLICY
 from diagnosis.search.claims import Round
 from diagnosis.search.search import Search
 from thermodrift_rivals.base import Claim, Reply, beyond_slack, bounds
+from twin.calibration.fit_problem import Block
 
 LOOKED_AT = 40  # candidates of a step whose criterion is computed, by their reduction at the weights of the step before
 REWEIGHTING_ROUNDS = 5  # of reweighting the channels
@@ -61,7 +64,7 @@ class _Sums:
             np.column_stack([x[:, at], b.residual]) for x, b in zip(done.screen.signatures.columns, blocks, strict=True)
         ]
         gram = np.zeros((len(now.rows), len(at) + 1, len(at) + 1))
-        for m, rows in zip(now.problem.measured, orthogonal_to_parameters(blocks, spread, every), strict=True):
+        for m, rows in zip(now.problem.measured, _beyond_parameters(blocks, spread, every), strict=True):
             for c, where in slices_of(m.channel):
                 gram[c] += rows[where].T @ rows[where]
         return cls(gram, now.rows, now.rows, *bounds(news))
@@ -106,3 +109,27 @@ class _Sums:
 
     def _weight(self, square: Array) -> Array:
         return np.asarray(self.rows / np.maximum(square, np.maximum(self.least, 1e-300)))
+
+
+def _beyond_parameters(blocks: Sequence[Block], spread: Array, drawn: Sequence[Array]) -> list[Array]:
+    """Signatures (n_b, K) less what one linear step of the parameters and nuisances, within their priors, explains.
+
+    Args:
+        blocks: of every batch, the problem linearised at a point.
+        spread: prior sd (p,) of the parameters.
+        drawn: signatures (n_b, K) of every batch, in units of the given noise.
+    """
+    size = len(spread)
+    information, shared, own = np.eye(size), np.zeros((size, drawn[0].shape[1])), []
+    for b, d in zip(blocks, drawn, strict=True):
+        jacobian, n = b.jacobian * spread, b.nuisance
+        factor = cho_factor(n.T @ n + np.eye(n.shape[1]))
+        of_jacobian, of_drawn = cho_solve(factor, n.T @ jacobian), cho_solve(factor, n.T @ d)
+        information += jacobian.T @ (jacobian - n @ of_jacobian)
+        shared += jacobian.T @ (d - n @ of_drawn)
+        own.append((jacobian, of_jacobian, of_drawn))
+    z = np.linalg.solve(information, shared)
+    return [
+        d - jacobian @ z - b.nuisance @ (of_drawn - of_jacobian @ z)
+        for b, d, (jacobian, of_jacobian, of_drawn) in zip(blocks, drawn, own, strict=True)
+    ]
