@@ -70,6 +70,11 @@ class Policy:
     specific_shares: tuple[float, ...] = analytic(
         (0.0, 0.3, 1.0, 4.0), "of a draw's specific variance", "grid of the likelihood"
     )
+    timing_shares: tuple[float, ...] = analytic(
+        (0.0, 0.3, 1.0),
+        "of the variance by times of changes",
+        "grid of the likelihood: a recorder may keep to its rows",
+    )
     structure_scales: tuple[float, ...] = analytic(
         (0.0, 0.06, 0.125, 0.25, 0.5, 1.0), "of the draws", "grid of the likelihood; what is larger is an effect"
     )

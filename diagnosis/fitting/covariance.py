@@ -1,8 +1,9 @@
 """The covariance of the residuals of a calibrated network: noise, structure of refined twins, known imperfections.
 
-``Σ = blocks + D Dᵀ``: a block per batch and channel of white noise and of the specific components of refined twins,
-and directions D (n, K), of sd 1 each, that all batches share: structure is the same in every run. Directions are
-unknowns of prior N(0, 1) like parameters, so that effects are judged with all of them integrated out.
+``Σ = blocks + D Dᵀ``: a block per batch and channel of white noise, of the specific components of refined twins and of
+the times at which drivers change, and directions D (n, K), of sd 1 each, that all batches share: structure is the same
+in every run. Directions are unknowns of prior N(0, 1) like parameters, so that effects are judged with all of them
+integrated out.
 """
 
 from __future__ import annotations
@@ -34,12 +35,13 @@ def slices_of(channel: NDArray[np.int64]) -> Slices:
 class Structure:
     """What covariances are learned from, in units of the given noise.
 
-    Of every batch `drawn` (n_b, T), draws of refined twins, and `known` (n_b, K), imperfections of any machine per sd;
-    `noise` (C,) is each channel's white noise. `stated` are the names of the unknowns whose values refined twins have
-    from their priors.
+    Of every batch `drawn` (n_b, T), draws of refined twins, `timing` (n_b, T), what other times of their drivers'
+    changes do, and `known` (n_b, K), imperfections of any machine per sd; `noise` (C,) is each channel's white noise.
+    `stated` are the names of the unknowns whose values refined twins have from their priors.
     """
 
     drawn: Sequence[Array]
+    timing: Sequence[Array]
     known: Sequence[Array]
     noise: Array
     stated: frozenset[str]
@@ -70,6 +72,7 @@ class Covariance:
     drawn: int = 0  # how many of the directions, the first ones, were drawn; the others are imperfections
     structure: Structure | None = None
     share: float = 0.0  # of the variance of specific components
+    timing: float = 0.0  # of the variance by times of changes
 
     @classmethod
     def of(cls, problem: CalibrationProblem, block: Callable[[int, int, slice], Array], **given: Any) -> Covariance:
@@ -119,17 +122,19 @@ def independent(problem: CalibrationProblem, noise: Array) -> Covariance:
     return Covariance.of(problem, lambda b, c, at: noise[c] ** 2 * np.eye(at.stop - at.start))
 
 
-def learned(problem: CalibrationProblem, structure: Structure, share: float) -> Covariance:
-    """White noise and, times `share`, the variance of the draws' specific components; all directions of sd 1."""
+def learned(problem: CalibrationProblem, structure: Structure, share: float, timing: float) -> Covariance:
+    """White noise, `share` of the variance of the draws' specific components and `timing` of that by times of changes,
+    which are of one run alone; all directions of sd 1."""
+    draws = structure.drawn[0].shape[1]
 
     def block(b: int, c: int, at: slice) -> Array:
-        specific = structure.specific[b][at]
+        specific, late = structure.specific[b][at], structure.timing[b][at]
         white = structure.noise[c] ** 2 * np.eye(len(specific))
-        return np.asarray(white + share / specific.shape[1] * specific @ specific.T, float)
+        return np.asarray(white + (share * specific @ specific.T + timing * late @ late.T) / draws, float)
 
-    drawn = structure.drawn[0].shape[1]
-    directions = structure.directions
-    return Covariance.of(problem, block, directions=directions, drawn=drawn, structure=structure, share=share)
+    return Covariance.of(
+        problem, block, directions=structure.directions, drawn=draws, structure=structure, share=share, timing=timing
+    )
 
 
 def white_noise(problem: CalibrationProblem) -> Array:

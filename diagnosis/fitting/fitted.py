@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -122,8 +123,8 @@ def structured(
     """
     names = [u.name for u in at.problem.unknowns]
     stated = frozenset(names) if stated is None else stated
-    drawn = _drawn(at, np.array([name in stated for name in names]), seed, report)
-    structure = Structure(drawn, imperfections(at), white_noise(at.problem), stated)
+    drawn, timing = _drawn(at, np.array([name in stated for name in names]), seed, report)
+    structure = Structure(drawn, timing, imperfections(at), white_noise(at.problem), stated)
     return _learned(_begun(at, *_likeliest(at, structure), runs))
 
 
@@ -203,30 +204,33 @@ def _learned(begun: Fitted) -> Fitted:
     return fitted
 
 
-def _drawn(at: Point, stated: Mask, seed: int, report: Callable[[str, int, int], None]) -> list[Array]:
-    """Misfits of refined twins (n_b, draws); unknowns that are `stated` (p,) scatter by their priors.
+def _drawn(
+    at: Point, stated: Mask, seed: int, report: Callable[[str, int, int], None]
+) -> tuple[list[Array], list[Array]]:
+    """Misfits of refined twins and of times of changes (n_b, draws); unknowns that are `stated` (p,) scatter by their
+    priors.
 
     A fit that lacks an effect imitates it by values that no machine has, and refined twins of such values would be made
     of the effect. What parameters may imitate of a misfit in one linear step is left in: priors and bounds say how far
     they go.
     """
     draws = POLICY.refined_twins
-    drawn = drawn_misfits(
+    drawn, timing = drawn_misfits(
         at.machine, at.part, at.batches, at.problem, np.where(stated, 0.0, at.z), stated.astype(float), draws, seed,
         lambda n, of: report("refined twins", n, of),
     )  # fmt: skip
     films = rising_films(at)  # linear about the fit: a film in every twin takes no simulation of its own
     sizes = np.abs(np.random.default_rng(seed).standard_normal((films[0].shape[1], draws)))
-    return clipped([d + f @ sizes for d, f in zip(drawn, films, strict=True)])
+    return clipped([d + f @ sizes for d, f in zip(drawn, films, strict=True)]), timing
 
 
 def _likeliest(at: Point, structure: Structure) -> tuple[Covariance, Hyper]:
-    """The covariance and hyperparameters of the largest marginal likelihood, over the share of
-    the specific components and the sizes of all that is integrated out."""
+    """The covariance and hyperparameters of the largest marginal likelihood, over the shares of the specific components
+    and of the times of changes, and the sizes of all that is integrated out."""
     blocks, begin = list(at.problem.linearise(at.x, at.nuisance)), Hyper(*POLICY.first_hyper)
     best, most = None, -np.inf
-    for share in POLICY.specific_shares:
-        covariance = learned(at.problem, structure, share)
+    for share, timing in product(POLICY.specific_shares, POLICY.timing_shares):
+        covariance = learned(at.problem, structure, share, timing)
         marginal = _marginal(covariance, blocks, at)
         hyper, likely = marginal.likeliest(marginal.grams(_columns(marginal, blocks, at)), begin)
         if likely > most:

@@ -59,9 +59,9 @@ def drawn_misfits(
     draws: int,
     seed: int,
     progress: Callable[[int, int], None] | None = None,
-) -> list[Array]:
-    """What `draws` refined twins show beyond the lumped one of the same values, (n_b, draws) of every batch in units of
-    the given noise.
+) -> tuple[list[Array], list[Array]]:
+    """What `draws` refined twins show beyond the lumped one of the same values, and what it does to each that drivers
+    change at other times within their rows; (n_b, draws) of every batch in units of the given noise.
 
     Args:
         centre, spread: mean and sd (p,) of the z that they have.
@@ -84,7 +84,8 @@ def drawn_misfits(
         if progress:
             progress(len(out), draws)
         if len(out) == draws:
-            return [np.column_stack(own) for own in zip(*out, strict=True)]
+            both = [np.stack(own, axis=1) for own in zip(*out, strict=True)]
+            return [d[..., 0] for d in both], [d[..., 1] for d in both]
     raise WorkError(
         f"machine {machine.machine}: {len(out)} of {4 * draws} refined twins could be simulated, expected {draws}; "
         "check the values of the machine file"
@@ -107,12 +108,15 @@ def _misfit(
     usual_W: Mapping[str, float],
     dice: Dice,
 ) -> list[Array]:
-    """One refined twin less the lumped one with the same totals, (n_b,) of every batch."""
+    """One refined twin less the lumped one with the same totals, and with other times of changes less itself, (n_b, 2)
+    of every batch."""
     network, values = problem.network, problem.values_at(x_of(problem.unknowns, z))
     finer, cut = refined(part, network, values, dice)
     fine = on_network(problem, batches, _bent(compile_network(machine, part=finer), usual_W, dice))
     known = {p.name: v for p, v in zip(network.parameters, values, strict=True)}
-    own = np.array([known.get(p.name, v) for p, v in zip(fine.network.parameters, fine.network.values, strict=True)])
+    own_values = np.array(
+        [known.get(p.name, v) for p, v in zip(fine.network.parameters, fine.network.values, strict=True)]
+    )
     n = len(batches)
     for body in cut:  # the history of a machine causes gradients
         cells = fine.network.bodies[body]
@@ -123,11 +127,9 @@ def _misfit(
     scatter = {name: np.exp(dice.of("run", name).normal(0.0, POLICY.run_to_run_log_sd, n)) for name in laws}
     last = Trajectory()  # the refined twin's begins at the lumped one's, where its laws act at as many places
     lump = _shown(problem, values, lambda inputs: inputs, last)
-
-    def acted(inputs: Inputs) -> Inputs:
-        return _timed(inputs, dice).with_own({**inputs.times, **scatter})
-
-    return [f - g for f, g in zip(_shown(fine, own, acted, last), lump, strict=True)]
+    own = _shown(fine, own_values, lambda inputs: inputs.with_own({**inputs.times, **scatter}), last)
+    late = _shown(fine, own_values, lambda inputs: _timed(inputs.with_own({**inputs.times, **scatter}), dice), last)
+    return [np.column_stack([f - g, t - f]) for f, g, t in zip(own, lump, late, strict=True)]
 
 
 def _usual_W(problem: CalibrationProblem, values: Array) -> dict[str, float]:

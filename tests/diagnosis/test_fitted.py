@@ -191,7 +191,7 @@ def test_refined_twins_have_what_the_machine_file_states_from_its_priors_and_eff
     """Values that a fit without an effect goes to would be those of no machine."""
     asked = []
 
-    def drawn(*given: object) -> list[Array]:
+    def drawn(*given: object) -> object:
         asked.append(given[4:6])
         return drawn_misfits(*given)  # type: ignore[arg-type]
 

@@ -50,11 +50,12 @@ def test_a_draw_that_runs_away_is_drawn_anew(monkeypatch: pytest.MonkeyPatch) ->
     at = consistent()
     rows = [len(m.row) for m in at.problem.measured]
     sizes = iter([1.0, 1e9, np.nan, 2.0, 3.0])
-    monkeypatch.setattr(twins, "_misfit", lambda *_: [np.full(n, size) for size in [next(sizes)] for n in rows])
+    monkeypatch.setattr(twins, "_misfit", lambda *_: [np.full((n, 2), size) for size in [next(sizes)] for n in rows])
     z = np.zeros_like(at.z)
-    drawn = twins.drawn_misfits(at.machine, at.part, at.batches, at.problem, z, z + 1.0, draws=3, seed=0)
-    assert [own.shape for own in drawn] == [(n, 3) for n in rows]
-    assert all((own == [1.0, 2.0, 3.0]).all() for own in drawn)
+    drawn, timing = twins.drawn_misfits(at.machine, at.part, at.batches, at.problem, z, z + 1.0, draws=3, seed=0)
+    for own in (*drawn, *timing):
+        assert (own == [1.0, 2.0, 3.0]).all()
+    assert [own.shape for own in drawn] == [own.shape for own in timing] == [(n, 3) for n in rows]
 
 
 def test_a_driver_changes_at_most_half_a_row_sooner_or_later_in_each_twin_by_its_own() -> None:
