@@ -162,9 +162,9 @@ class Policy:
     impossible_min_rows: int = convention(3, "rows", "a single one may be a fault of the recording")
     unseen_start_sd: float = analytic(2.0, "sd", "by which a body without a sensor may start off")
     claim_offset: float = development(
-        4.82, "log odds", "a logistic fit of 99 claims of first rounds, 36 of them right: results/claims.csv"
+        4.54, "log odds", "a logistic fit of 82 claims of first rounds, 45 of them right: results/claims.csv"
     )
-    claim_weight: float = development(1.31, "log odds", "of the same fit, for the logarithm of the relative gain")
+    claim_weight: float = development(1.11, "log odds", "of the same fit, for the logarithm of the relative gain")
     claim_min_probability: float = convention(
         0.7, "probability", "a false claim costs more than twice as much as a missed one"
     )
