@@ -189,14 +189,13 @@ def test_refined_twins_have_what_the_machine_file_states_from_its_priors_and_eff
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Values that a fit without an effect goes to would be those of no machine."""
-    asked = []
+    done, asked = with_the_floor(), []
 
     def drawn(*given: object) -> object:
         asked.append(given[4:6])
         return drawn_misfits(*given)  # type: ignore[arg-type]
 
     monkeypatch.setattr(fitted, "drawn_misfits", drawn)
-    done = with_the_floor()
     off = replace(done, z=done.z + 0.5)
     for one in (done, off):
         restructured(one)

@@ -29,6 +29,7 @@ from twin.compile import compile_network
 from twin.quantity import Value
 
 COLD = {**FLOOR, "parameters": {"conductance": "8 W/K"}}
+FAR = {**SHIFT, "parameters": {"shift": "12 um"}}
 
 
 @cache
@@ -37,7 +38,7 @@ def found(case: str) -> Search:
         done = diagnosed("consistent" if case == "nothing" else "explained").search
         assert done is not None
         return done
-    hidden, count = ({"a": COLD}, 6) if case == "floor" else ({"a": DRIFT, "b": SHIFT}, 8)
+    hidden, count = ({"a": COLD}, 6) if case == "floor" else ({"a": DRIFT, "b": FAR}, 8)
     return search(fitted(two_bodies(), runs(two_bodies(), hidden, count)))
 
 
